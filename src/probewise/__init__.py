@@ -26,6 +26,7 @@ and posterior: `nested.run`), `inquiry` (where to measure next), `experiment` (t
 from __future__ import annotations
 
 import importlib
+from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 from probewise._version import __version__
@@ -81,7 +82,7 @@ __all__ = [
     "read_simulator",
 ]
 
-# What is loaded when it is first used: names by their package, and packages.
+# Names that are loaded when they are first used, by their package; packages are too.
 _NAMES = {
     "calibration": ("read_sensor",),
     "inquiry": ("Inquiry",),
@@ -90,16 +91,11 @@ _NAMES = {
     "systems": ("Law", "Simulator", "read_simulator"),
 }
 _HOME = {name: home for home, names in _NAMES.items() for name in names}
-_PACKAGES = (
-    *("arm", "calibration", "diagnosis", "effects", "emulator", "errors", "experiment", "inference", "inquiry"),
-    *("investigation", "nested", "priors", "progress", "proof", "recordings", "report", "scene", "sensor", "systems"),
-    "world",
-)
 
 
 def __getattr__(name: str) -> object:
     """Load a package, or a value of one, when it is first asked for (PEP 562)."""
-    if name not in _HOME and name not in _PACKAGES:
+    if name not in _HOME and (name.startswith("_") or find_spec(f"probewise.{name}") is None):
         raise AttributeError(f"module 'probewise' has no attribute {name!r}")
     home = importlib.import_module(f"probewise.{_HOME.get(name, name)}")
     found = getattr(home, name) if name in _HOME else home

@@ -1,8 +1,9 @@
 """What a command writes: files whole or not at all, results all or none, without losing an input; drawings last.
 
-The results of a command are written into a hidden folder inside `--out`. When all are complete, that folder is renamed;
-only then are they moved. A process killed before that has changed nothing; after that, the next command with the same
-`--out` moves the remaining files first.
+The results of a command are written into a hidden folder inside `--out`, with a list of their names and digests. When
+all are complete, that folder is renamed; only then are they moved. A process killed before that has changed nothing;
+after that, the next command with the same `--out` moves the remaining files first. What stands in `--out` unchanged
+since the list there was written is an earlier result and is replaced or removed; any other file is a person's.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from probewise.progress import Progress, silent
 
 PAGE = "report.html"
 _STAGED, _COMPLETE = ".probewise-writing", ".probewise-complete"  # no person's folder has such a name
-_OUTDATED = ".outdated"  # ends the name of an empty file: the file of that name without it is to be removed
+_LIST, _BEFORE = ".probewise-written", ".probewise-before"  # {name: SHA-256} of files, in JSON
 _KEPT = "_kept"  # ends the name, without its ending, of a person's file that a result would have replaced
 _MOST_FAILED = 3  # drawings that a message names
 _MAIN_FILES = {
@@ -203,7 +204,7 @@ def checked_output_file(path: Path, *inputs: Path | None, option: str = "--out")
 class StagedFiles:
     """Files written into an empty directory, `folder`, and what they replace where they are moved.
 
-    `kept` has the new path of each input file; `replaces` is True if a file of an earlier run is replaced.
+    `kept` has the new path of each file that stood in the way; `replaces` is True if earlier results are replaced.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -228,36 +229,31 @@ class StagedFiles:
 
 @contextlib.contextmanager
 def staged_output(
-    out: Path,
-    *,
-    inputs: Sequence[Path] = (),
-    drawn: Sequence[str] = (),
-    outdated: Sequence[str] = (),
-    main: str | None = None,
+    out: Path, main: str = "", *, inputs: Sequence[Path] = (), adds: bool = False
 ) -> Iterator[StagedFiles]:
     """Yield an empty directory; move its files into `out`, made if missing, only if the block succeeds.
 
-    If the file `main` is in `out`, or for None, other files there are of an earlier run: they are replaced, and removed
-    if they are to be `drawn` later or have one of the patterns `outdated`. Without it they are a person's: such a file
-    gets another name, as does one of the `inputs` of this run that a result would replace. FileError if `out`
+    Earlier results, which the list in `out` of runs with the file `main` names and nobody has changed, are replaced, or
+    removed unless this run `adds` to them. Whatever else is in the way gets another name, as do the `inputs` of this
+    run, and with it an earlier result of that name with another ending: the description of a table. FileError if `out`
     cannot be made or written to, another process writes there for too long, a directory has the name of a result, or a
-    symbolic link that of a directory.
+    file or symbolic link that of a directory.
     """
     folder = out / _STAGED
     with _errors_of(out, "made", "a directory you may write to"):
         out.mkdir(parents=True, exist_ok=True)
     with hold_lock(out / "results", patience_s=_PATIENCE_S):
-        _move_into_place(out)
+        stage = StagedFiles(folder)
+        stage.kept |= _move_into_place(out)
         _remove(folder)
         folder.mkdir()
-        stage = StagedFiles(folder)
         try:
             yield stage
             raise_if_stopped()
             with defer_signals():
-                _complete(out, stage, {os.path.realpath(path) for path in inputs}, drawn, outdated, main)
+                _complete(out, stage, f"{_LIST}-{main}" if main else _LIST, inputs, adds=adds)
                 os.rename(folder, out / _COMPLETE)
-                _move_into_place(out)
+                stage.kept |= _move_into_place(out)
         except FileError as error:
             if not Path(error.path).is_relative_to(folder):
                 raise
@@ -267,59 +263,90 @@ def staged_output(
             shutil.rmtree(folder, ignore_errors=True)
 
 
-def _complete(
-    out: Path, stage: StagedFiles, inputs: set[str], drawn: Sequence[str], outdated: Sequence[str], main: str | None
-) -> None:
-    """Add to the results copies of the files that they would destroy, `kept`, and marks of outdated files."""
-    names = _files_in(stage.folder)
-    for name in names:
-        _require_ordinary((out / name).parents[: name.count("/")])
-        if (out / name).is_dir():
-            raise FileError(out / name, "a directory of that name is in the way", "another folder, or none there")
-    replaced = [out / name for name in names if os.path.realpath(out / name) in inputs]
-    earlier = [path for pattern in (*outdated, *map(glob.escape, drawn)) for path in out.glob(pattern)]
-    if main is not None and not (main and (out / main).exists()):
-        folder = os.path.realpath(out)  # behind a link lies nothing that a result could destroy
-        standing = dict.fromkeys([*(out / name for name in names), *earlier])
-        plain = [path for path in standing if os.path.realpath(path) == os.path.join(folder, path.relative_to(out))]
-        earlier = [path for path in plain if path.is_file() and os.path.realpath(path) not in inputs]
-        replaced += earlier
-    stage.replaces = any(os.path.lexists(out / name) for name in names if out / name not in replaced)
-    for ending in itertools.chain([_KEPT], (f"{_KEPT}_{k}" for k in itertools.count(2))):
-        stage.kept = {path: path.with_stem(path.stem + ending) for path in replaced}
-        if not any(os.path.lexists(path) for path in stage.kept.values()):
-            break
-    for path, new in stage.kept.items():
-        name = new.relative_to(out).as_posix()
-        stage.write(name, path.read_bytes())
-        shutil.copystat(path, stage / name)
-    for path in earlier:
-        name, is_persons = path.relative_to(out).as_posix(), _KEPT in path.stem
-        if os.path.realpath(path) not in inputs and not (name in names or is_persons or path.is_dir()):
-            _require_ordinary(path.parents[: name.count("/")])
-            mark = stage / (name + _OUTDATED)
-            mark.parent.mkdir(exist_ok=True)
-            mark.touch()
+def _complete(out: Path, stage: StagedFiles, written: str, inputs: Iterable[Path], *, adds: bool) -> None:
+    """Add to the results their list, `written`, and what it was before in `out`, but for `inputs`."""
+    names, listed, inside = _files_in(stage.folder), _listed(out / written), Path(os.path.realpath(out))
+    for name in (*names, written):
+        _require_place(out, name)
+    read = {os.path.realpath(path) for path in inputs}
+    before = {name: digest for name, digest in listed.items() if str(inside / name) not in read}
+    after = (before if adds else {}) | {name: _digest(stage.folder, name) for name in names}
+    replaced = (name for name, digest in before.items() if after.get(name) != digest)
+    stage.replaces = any(_digest(out, name) == before[name] for name in replaced)
+    stage.write_json(_BEFORE, before)
+    stage.write_json(written, after)
 
 
-def _move_into_place(out: Path) -> None:
-    """Move complete results, if there are any, into `out`; a process killed here leaves the rest to the next one.
+def _move_into_place(out: Path) -> dict[Path, Path]:
+    """Move complete results, if there are any, into `out`; return the new path of each file that was in the way.
 
-    A stranger's folder may hold such results too: they can replace files of that folder only.
+    A process killed here leaves the rest to the next one. A stranger's folder may hold such results and lists too:
+    they can replace files of that folder only.
     """
     complete = out / _COMPLETE
     cure = f"the next results written to {out} put the rest in place first, or remove {complete} to drop it"
     with _errors_of(complete, "moved", f"files in few folders; {cure}"):
         names = [] if complete.is_symlink() else _files_in(complete)
     for name in names:
-        _require_ordinary((out / name).parents[: name.count("/")])
-        with _errors_of(out / name.removesuffix(_OUTDATED), "replaced", f"a file that no other program holds; {cure}"):
-            (out / name).parent.mkdir(parents=True, exist_ok=True)
-            if name.endswith(_OUTDATED):
-                (out / name.removesuffix(_OUTDATED)).unlink(missing_ok=True)
-            else:
-                os.replace(complete / name, out / name)
+        _require_place(out, name)
+    results = [name for name in names if not name.startswith((_BEFORE, _LIST))]
+    written = next((name for name in names if name.startswith(_LIST)), "")  # moved last
+    before, after = (_listed(complete / name) if written else {} for name in (_BEFORE, written))
+    outdated = before.keys() - after.keys()
+    # A table and its description, of the same name but for the ending, stay together.
+    stems = {os.path.splitext(name)[0] for name in {*results, *outdated}}
+    standing = [n for n in {*before, *results} if os.path.splitext(n)[0] in stems and os.path.lexists(out / n)]
+    unchanged = {name for name in standing if _digest(out, name) in (before.get(name), after.get(name))}
+    of_person = {os.path.splitext(name)[0] for name in standing if name not in unchanged}
+    named = {name for name in standing if os.path.splitext(name)[0] in of_person}
+    in_the_way = [out / name for name in reversed(results) if name in named]  # .json before .csv, in case it is killed
+    for ending in itertools.chain([_KEPT], (f"{_KEPT}_{k}" for k in itertools.count(2))):
+        kept = {path: path.with_stem(path.stem + ending) for path in in_the_way}
+        if not any(map(os.path.lexists, kept.values())):
+            break
+    for name in (unchanged & outdated) - named:
+        (out / name).unlink()
+    moved = [*results, *[written] * bool(written)]
+    for path, new in (kept | {complete / name: out / name for name in moved}).items():
+        with _errors_of(new, "replaced", f"a file that no other program holds; {cure}"):
+            new.parent.mkdir(parents=True, exist_ok=True)
+            os.replace(path, new)
     _remove(complete)
+    return kept
+
+
+def _require_place(out: Path, name: str) -> None:
+    """Raise FileError if a directory has the name of a result, or anything else that of its directory."""
+    path = out / name
+    folders = path.parents[: name.count("/")]
+    _require_ordinary(folders)
+    if path.is_dir() and not path.is_symlink():
+        raise FileError(path, "a directory of that name is in the way", "another folder, or none there")
+    for folder in filter(Path.is_file, folders):
+        raise FileError(folder, "a file of that name is in the way", "another folder, or none there")
+
+
+def _listed(file: Path) -> dict[str, object]:
+    """Read a list of files that were written into a folder; it is empty if there is none, or it is damaged."""
+    import json  # here, as help needs none
+
+    with contextlib.suppress(OSError, ValueError, AttributeError, RecursionError):
+        listed = json.loads(file.read_bytes() if file.is_file() and not file.is_symlink() else b"{}").items()
+        return {name: digest for name, digest in listed if digest}
+    return {}
+
+
+def _digest(folder: Path, name: str) -> str:
+    """Return the SHA-256 of a file in a folder; "" if it is none, is out of the folder or behind a link."""
+    import hashlib  # here, as help needs none
+
+    with contextlib.suppress(OSError, ValueError):  # of a name that no file has
+        inside = Path(os.path.realpath(folder))
+        path = inside / name
+        if inside in path.parents and os.path.realpath(path) == str(path) and path.is_file():
+            with open(path, "rb") as file:
+                return hashlib.file_digest(file, "sha256").hexdigest()
+    return ""
 
 
 def _files_in(folder: Path) -> list[str]:
@@ -349,14 +376,12 @@ def _remove(path: Path) -> None:
 class Output(NamedTuple):
     """What is written of a run: files by `files`, figures by name of file, and a page of the drawn figures.
 
-    `outdated` are patterns of files that an earlier run may have left, `main` the file by which its results are known;
-    "": there was none.
+    `main` is the file by which results of its kind are known; "": there is none.
     """
 
     files: Callable[[StagedFiles], None]
     drawers: Mapping[str, Callable[[], bytes]]
     page: Callable[[Mapping[str, bytes]], str]
-    outdated: Sequence[str] = ()
     main: str = ""
 
 
@@ -367,7 +392,7 @@ class NotDrawnError(ProbewiseError):
 class Drawings:
     """Figures and pages of a run, drawn after its results were written: if one fails, only that one is missing.
 
-    `notes` are lines to print, on inputs that got another name, and on results that were replaced.
+    `notes` are lines to print, on files that got another name, and on results that were replaced.
     """
 
     def __init__(self, out: Path) -> None:
@@ -386,24 +411,30 @@ class Drawings:
         raise_if_stopped()  # a signal may have damaged the picture
         return content
 
-    def write_report(
-        self,
-        drawers: Mapping[str, Callable[[], bytes]],
-        page: Callable[[Mapping[str, bytes]], str],
-        *,
-        inputs: Sequence[Path] = (),
-        progress: Progress = silent,
-    ) -> None:
-        """Draw figures, by name, and the page report.html into the directory of results, which are complete there.
+    @contextlib.contextmanager
+    def staged(self, main: str, *, inputs: Sequence[Path] = (), adds: bool = True) -> Iterator[StagedFiles]:
+        """Stage files as `staged_output` does; note what got another name."""
+        with staged_output(self.out, main, inputs=inputs, adds=adds) as stage:
+            yield stage
+        self.notes += [f"note: what was {path} is now {now}" for path, now in stage.kept.items()]
 
-        `page` builds the HTML from the figures by name; b"" stands for one that could not be drawn. NotDrawnError if
-        none can be written.
+    def write_results(
+        self, made: Output, *, inputs: Sequence[Path] = (), adds: bool = False, progress: Progress = silent
+    ) -> None:
+        """Write the files of a run, all or none, then its figures and its page; `adds` is that of `staged_output`.
+
+        NotDrawnError if figures and page cannot be written; those that cannot be drawn are b"" for the page, and told
+        by `raise_if_any_failed`.
         """
+        progress("writing the results")
+        with self.staged(made.main, inputs=inputs, adds=adds) as stage:
+            made.files(stage)
+        self.notes += ["note: the results of an earlier run there were replaced"] * stage.replaces
         kept = f"the results are in {self.out}, without figures and report"
         drawn: dict[str, bytes] = {}
-        every = {**drawers, PAGE: lambda: page(drawn).encode("utf-8", "backslashreplace")}
+        every = {**made.drawers, PAGE: lambda: made.page(drawn).encode("utf-8", "backslashreplace")}
         try:
-            with reporting_what_is_kept(lambda: kept), staged_output(self.out, inputs=inputs) as stage:
+            with reporting_what_is_kept(lambda: kept), self.staged(made.main, inputs=inputs) as stage:
                 for name, drawer in every.items():
                     progress("drawing the report", len(drawn), len(every), name)
                     drawn[name] = self.draw(name, drawer)
@@ -411,16 +442,6 @@ class Drawings:
                         stage.write(name, drawn[name])
         except FileError as error:  # such as a full disk
             raise NotDrawnError(f"{error}; {kept}") from error
-
-    def write_results(self, made: Output, *, inputs: Sequence[Path] = (), progress: Progress = silent) -> None:
-        """Write the files of a run, all or none, then figures and page; remove outdated files of an earlier run."""
-        progress("writing the results")
-        drawn, main = (*made.drawers, PAGE), made.main
-        with staged_output(self.out, inputs=inputs, drawn=drawn, outdated=made.outdated, main=main) as stage:
-            made.files(stage)
-        self.write_report(made.drawers, made.page, inputs=inputs, progress=progress)
-        self.notes = [f"note: what was {path} is now {now}" for path, now in stage.kept.items()]
-        self.notes += ["note: the results of an earlier run there were replaced"] * stage.replaces
 
     def raise_if_any_failed(self) -> None:
         """Raise NotDrawnError, in one line, if something could not be drawn."""

@@ -91,7 +91,7 @@ def test_a_recording_that_a_dead_line_ended_goes_on(bricks, plan_file, tmp_path,
     arguments = ["arm", "record", plan_file, "--out", out, "--arm", "nxt:x", "--quiet"]
     status, said = run(capsys, *arguments)
     assert status == 1
-    assert said.endswith("cut; nothing was read\n")
+    assert said.endswith("cut; nothing was written\n")
     status, said = run(capsys, *arguments)
     assert status == 1
     assert "rec.csv keeps 4 of 13 readings; go on with: probewise arm record" in said

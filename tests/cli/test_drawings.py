@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 
 from probewise._signals import Stopped
-from probewise._writing import Drawings, NotDrawnError
+from probewise._writing import Drawings, NotDrawnError, Output
 from probewise.cli import main
 from probewise.errors import FileError
 from probewise.proof import concealed_study
@@ -88,15 +88,56 @@ def test_a_command_that_cannot_draw_writes_the_rest_says_so_in_a_line_and_exits_
     assert "(KeyError: 0.0)" in said
     out = tmp_path / "out"
     assert {
-        path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file() and path.suffix != ".lock"
+        path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file() and path.name[0] != "."
     } == set(COMMANDS[command])
+
+
+JOURNALS = ("journal.jsonl", "trials.jsonl", "concealed.jsonl", "cases.jsonl", "rounds")  # continued, or refused
+
+
+@pytest.mark.usefixtures("short_study")
+@pytest.mark.parametrize(
+    "command",
+    [
+        pytest.param(words, marks=[] if words.startswith(QUICK[:1]) or "--live" in words else pytest.mark.slow)
+        for words in (*COMMANDS, "diagnose data.csv --simulator heater.py --each", "explore --max-readings 1")
+    ],
+)
+def test_a_persons_file_of_any_name_that_a_verb_writes_survives(
+    command, recording_file, sensor_file, tmp_path, monkeypatch, capsys
+):
+    """Also what a person made of a result; what nobody has touched is replaced."""
+    monkeypatch.setattr("webbrowser.open", lambda url: None)
+    (tmp_path / "heater.py").write_text(FILE)
+    (tmp_path / "data.csv").write_text(run_table_csv(runs(rng=np.random.default_rng(2))))
+    monkeypatch.chdir(tmp_path)
+    verb, *words = command.split()
+
+    def names_in(out):
+        names = [path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()]
+        return sorted(name for name in names if "/." not in f"/{name}" and not name.startswith(JOURNALS))
+
+    plain, out = tmp_path / "plain", tmp_path / "out"
+    assert main([verb, *words, "--out", "plain", "--quiet"]) == 0
+    written = names_in(plain)
+    for name in written:
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        (out / name).write_text(f"mine {name}")
+    for again in range(1 if any((plain / name).exists() for name in JOURNALS) else 2):
+        assert main([verb, *words, "--out", "out"]) == 0
+        left = names_in(out)
+        assert set(written) < set(left)
+        assert len(left) == 2 * len(written)
+        found = sorted(text for text in ((out / name).read_bytes() for name in left) if text.startswith(b"mine "))
+        assert found == sorted(f"mine {name}".encode() for name in written)
+        assert ("note: what was " in capsys.readouterr().out) is not again
 
 
 def test_one_figure_that_fails_leaves_the_others(tmp_path):
     drawings = Drawings(tmp_path)
     drawers = {"first.svg": lambda: b"first", "second.svg": lambda: 1 // 0, "third.svg": lambda: b"third"}
-    drawings.write_report(drawers, lambda drawn: f"page with {sorted(drawn.values())}")
-    assert {path.name: path.read_text() for path in tmp_path.iterdir() if path.suffix != ".lock"} == {
+    drawings.write_results(Output(lambda stage: None, drawers, lambda drawn: f"page with {sorted(drawn.values())}"))
+    assert {path.name: path.read_text() for path in tmp_path.iterdir() if path.name[0] != "."} == {
         "first.svg": "first",
         "third.svg": "third",
         "report.html": "page with [b'', b'first', b'third']",
@@ -106,10 +147,10 @@ def test_one_figure_that_fails_leaves_the_others(tmp_path):
 
 
 def test_a_picture_of_a_step_for_which_there_is_no_room_ends_no_search(sensor_file, tmp_path, monkeypatch, capsys):
-    def full(path, content):
-        raise FileError(path, "cannot be written (No space left on device)", "a disk with room")
+    def full(search, name, content):
+        raise FileError(name, "cannot be written (No space left on device)", "a disk with room")
 
-    monkeypatch.setattr("probewise.cli.explore.write_bytes_atomically", full)
+    monkeypatch.setattr("probewise.cli.explore.Search.write", full)
     words = ("explore", "--sensor", sensor_file, "--max-readings", 1, "--trust", 1, "--quiet", "--out", tmp_path)
     assert main([str(word) for word in words]) == 1
     assert "could not draw frames/001.png (FileError: " in capsys.readouterr().err
@@ -119,7 +160,7 @@ def test_a_picture_of_a_step_for_which_there_is_no_room_ends_no_search(sensor_fi
 def test_a_page_that_cannot_be_written_is_one_that_is_not_drawn(tmp_path):
     (tmp_path / "report.html").mkdir()
     with pytest.raises(NotDrawnError, match=r"a directory of that name .*; the results are in .*, without figures"):
-        Drawings(tmp_path).write_report({}, lambda drawn: "page")
+        Drawings(tmp_path).write_results(Output(lambda stage: None, {}, lambda drawn: "page"))
 
 
 def test_an_interruption_while_figures_are_drawn_says_where_the_results_are(tmp_path):
@@ -127,8 +168,8 @@ def test_an_interruption_while_figures_are_drawn_says_where_the_results_are(tmp_
         raise KeyboardInterrupt
 
     with pytest.raises(Stopped, match=r"the results are in .*, without figures and report"):
-        Drawings(tmp_path).write_report({"first.svg": interrupt}, lambda drawn: "")
-    assert [path.name for path in tmp_path.iterdir()] == [".results.lock"]
+        Drawings(tmp_path).write_results(Output(lambda stage: None, {"first.svg": interrupt}, lambda drawn: ""))
+    assert not [path for path in tmp_path.iterdir() if path.name[0] != "."]
 
 
 def test_a_page_says_where_a_figure_is_missing():

@@ -69,8 +69,8 @@ FOLDERS = {
     "a link among the complete": linked(".probewise-complete/d"),
     "a link to a file among the complete": linked(".probewise-complete/report.html", "../outside/victim.txt"),
     "a folder that is a link": through_link,
-    "only the ending": complete(".outdated"),
-    "an outdated folder": lambda out: [complete("sub.outdated")(out), (out / "sub").mkdir()],
+    "a folder that is a file": lambda out: [complete("sub/a")(out), (out / "sub").touch()],
+    "a list that is a folder": lambda out: (out / ".probewise-written").mkdir(),
     "complete in itself": complete(".probewise-complete/a", ".probewise-writing/b", ".results.lock"),
     "a result that is a link": linked("report.html", "../outside/victim.txt"),
     "a lock that is a link": linked(".results.lock", "../outside/victim.txt"),
@@ -92,7 +92,7 @@ def test_nothing_outside_a_hostile_folder_changes_and_the_way_out_is_said(build,
     build(out)
 
     def write():
-        with staged_output(out, outdated=("*.svg",)) as stage:
+        with staged_output(out) as stage:
             stage.write("report.html", "new")
 
     refusal = None
@@ -144,17 +144,14 @@ def test_a_link_or_a_pipe_where_a_run_would_write_is_refused_before_it_begins(
     assert (tmp_path / "victim").read_text() == "precious"
 
 
-@pytest.mark.parametrize(
-    ("words", "name"),
-    [("explore --max-readings 1", "frames/holiday.png"), ("investigate --plan paper --rounds 1", "rounds/1.csv")],
-)
-def test_a_persons_folder_of_the_name_of_a_runs_is_left_alone(words, name, sensor_file, tmp_path, capsys):
-    mine = tmp_path / "out" / name
+def test_a_persons_folder_of_the_name_of_a_runs_is_left_alone(sensor_file, tmp_path, capsys):
+    mine = tmp_path / "out" / "rounds" / "1.csv"
     mine.parent.mkdir(parents=True)
     mine.write_text("mine")
-    assert main([*words.split(), "--sensor", str(sensor_file), "--out", str(tmp_path / "out")]) == 2
+    words = ["investigate", "--plan", "paper", "--rounds", "1", "--sensor", str(sensor_file)]
+    assert main([*words, "--out", str(tmp_path / "out")]) == 2
     assert f"{mine.parent}: " in capsys.readouterr().err
-    assert contents(tmp_path / "out") == {mine.parent.name: None, name: "mine"}
+    assert contents(tmp_path / "out") == {"rounds": None, "rounds/1.csv": "mine"}
 
 
 def predict(sensor_file, recording_file, out):

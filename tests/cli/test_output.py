@@ -1,8 +1,10 @@
 """Results are written whole or not at all, and nothing that was read is lost for them."""
 
 import contextlib
+import hashlib
 import io
 import itertools
+import json
 import os
 import signal
 from pathlib import Path
@@ -14,38 +16,111 @@ from probewise._writing import Drawings, Output, staged_output
 from probewise.calibration import read_sensor, write_sensor
 from probewise.cli import main
 from probewise.cli._common import OutputError, print_result
-from probewise.cli._inputs import holds_readings
 from probewise.errors import FileError
-from probewise.recordings import read_recording, write_recording, write_text_atomically
+from probewise.recordings import read_recording, write_recording
 
 
-def test_what_an_earlier_run_left_behind_goes_and_what_is_not_ours_stays(tmp_path):
-    (tmp_path / "frames").mkdir()
-    for name in ("witness_time.svg", "witness_level.svg", "notes.txt", "007.png", "frames/007.png"):
-        (tmp_path / name).write_text("old")
-    with staged_output(tmp_path, outdated=("witness_*.svg", "frames/*.png")) as stage:
-        (stage / "witness_level.svg").write_text("new")
-    assert not any((tmp_path / "frames").iterdir())
+def write(out, files, main="", **options):
+    with staged_output(out, main, **options) as stage:
+        for name, text in files.items():
+            stage.write(name, text)
+    return stage
+
+
+def test_what_an_earlier_run_wrote_goes_and_what_a_person_changed_or_put_there_stays(tmp_path):
+    earlier = ("witness_time.svg", "witness_level.svg", "changed.svg", "frames/007.png", "taken.csv", "taken.json")
+    write(tmp_path, dict.fromkeys(earlier, "old"))
+    for name in ("notes.txt", "007.png", "changed.svg", "taken.csv"):
+        (tmp_path / name).write_text("mine")
+    assert write(tmp_path, {"witness_level.svg": "new"}).replaces
     (tmp_path / "frames").rmdir()
-    assert contents(tmp_path) == {"witness_level.svg": "new", "notes.txt": "old", "007.png": "old"}
+    mine = dict.fromkeys(("notes.txt", "007.png", "changed.svg", "taken.csv"), "mine")
+    assert contents(tmp_path) == {"witness_level.svg": "new", "taken.json": "old", **mine}
+    assert not write(tmp_path, {"more.svg": "new", "notes.txt": "mine"}, adds=True).replaces
+    assert contents(tmp_path) == {"witness_level.svg": "new", "more.svg": "new", "taken.json": "old", **mine}
+    assert write(tmp_path, {}).kept == {}
+    assert contents(tmp_path).keys() == {"taken.json", *mine} - {"notes.txt"}  # which the run wrote as it was
 
 
-@pytest.mark.parametrize("main_file", ["", "main.json"])
-def test_a_persons_files_get_other_names_or_stay_where_no_run_has_written(main_file, tmp_path):
-    """A folder without the main file of a verb's results holds none, whatever the names in it."""
-    names = ("a.svg", "b.csv", "witness_time.svg", "report.html", "next.csv", ".writing", ".complete", ".a.svg.part")
+def test_results_of_another_verb_stay_or_get_other_names(tmp_path):
+    """As those of a calibration, where a search with its sensor.json writes too."""
+    sensor = tmp_path / "sensor.json"
+    write(tmp_path, {"sensor.json": "1", "ssf.png": "1", "report.html": "1"}, "sensor.json")
+    for k in "23":
+        write(tmp_path, {}, "result.json", inputs=(sensor,))
+        write(
+            tmp_path, {"sensor.json": k, "result.json": k, "report.html": k}, "result.json", inputs=(sensor,), adds=True
+        )
+    names = {"ssf.png": "1", "sensor_kept.json": "1", "sensor_kept_2.json": "2", "report_kept.html": "1"}
+    assert contents(tmp_path) == {**names, **dict.fromkeys(("sensor.json", "result.json", "report.html"), "3")}
+
+
+def test_a_persons_files_get_other_names_or_stay_in_a_folder_without_a_list(tmp_path):
+    """As one that an earlier version wrote, which nobody can tell from a person's."""
+    names = ("a.svg", "b.csv", "b.json", "witness_time.svg", "report.html", ".writing", ".complete", ".a.svg.part")
     for name in names:
         (tmp_path / name).write_text(f"mine {name}")
-    made = Output(lambda stage: stage.write("b.csv", "new"), {"a.svg": lambda: b"new"}, lambda drawn: "new")
-    drawings = Drawings(tmp_path)
-    drawings.write_results(made._replace(outdated=("witness_*", "next.csv"), main=main_file))
-    found = contents(tmp_path)
-    assert {found.pop(name) for name in ("a.svg", "b.csv", "report.html")} == {"new"}
-    assert sorted(found.values()) == sorted(f"mine {name}" for name in names)
-    assert len(drawings.notes) == 5
-    (tmp_path / "main.json").touch()
-    drawings.write_results(made._replace(outdated=("witness_*", "next.csv"), main="main.json"))
-    assert found.items() <= contents(tmp_path).items()
+    results = {"b.csv": "new", "b.json": "mine b.json"}
+    made = Output(
+        lambda stage: [stage.write(*each) for each in results.items()], {"a.svg": lambda: b"new"}, lambda _: "new"
+    )
+    for _ in range(2):
+        drawings = Drawings(tmp_path)
+        drawings.write_results(made)
+        found = contents(tmp_path)
+        assert {found.pop(name) for name in ("a.svg", "b.csv", "report.html")} == {"new"}
+        assert found.pop("b.json") == found["b_kept.json"]  # a table has its description with it
+        assert sorted(found.values()) == sorted(f"mine {name}" for name in names)
+    assert drawings.notes == ["note: the results of an earlier run there were replaced"]
+
+
+LISTS = {
+    "outside": {
+        "../victim": "{digest}",
+        "/victim": "{digest}",
+        "{outside}": "{digest}",
+        "sub/../../victim": "{digest}",
+    },
+    "behind a link": {"link": "{digest}", "linked/victim": "{digest}"},
+    "no file": {"folder": "", "": "{digest}", ".": "", "..": "", "none": None, "a\0b": "{digest}"},
+    "wrong types": {"mine.txt": 1, "b.txt": ["{digest}"], "c.txt": {"{digest}": "{digest}"}},
+    "no names": "{digest}",
+    "a list": ["mine.txt"],
+    "no UTF-8": {"\ud800": "{digest}", "x" * 5000: "{digest}"},
+}
+
+
+@pytest.mark.parametrize("listed", [*LISTS.values(), "damaged", "deep", "link", "pipe"], ids=[*LISTS, *"1234"])
+def test_a_hostile_list_removes_nothing_and_stops_nothing(listed, tmp_path):
+    out, file = tmp_path / "out", tmp_path / "out" / ".probewise-written"
+    (out / "folder").mkdir(parents=True)
+    for name in ("victim", "out/mine.txt"):
+        (tmp_path / name).write_text("mine")
+    (out / "link").symlink_to(tmp_path / "victim")
+    (out / "linked").symlink_to(tmp_path)
+    digest = hashlib.sha256(b"mine").hexdigest()
+    match listed:
+        case "damaged":
+            file.write_bytes(b'{"mine.txt": "\xff')
+        case "deep":
+            file.write_text("[" * 100_000)
+        case "link":
+            (tmp_path / "list").write_text(json.dumps({"mine.txt": digest}))
+            file.symlink_to(tmp_path / "list")
+        case "pipe":
+            os.mkfifo(file)
+        case _:
+            text = json.dumps(listed).replace("{digest}", digest)
+            file.write_text(text.replace("{outside}", str(tmp_path / "victim")))
+    write(out, {"mine.txt": "new", "link": "new"})
+    assert (tmp_path / "victim").read_text() == (out / "mine_kept.txt").read_text() == "mine"
+    assert (out / "link_kept").readlink() == tmp_path / "victim"
+    assert {path.name for path in out.iterdir() if path.name[0] != "."} == {
+        *("folder", "link", "link_kept", "linked", "mine.txt", "mine_kept.txt")
+    }
+    write(out, {})
+    assert not (out / "mine.txt").exists()
+    assert (out / "mine_kept.txt").exists()
 
 
 def test_an_input_that_would_be_replaced_is_set_aside_with_its_description(tmp_path):
@@ -53,9 +128,7 @@ def test_an_input_that_would_be_replaced_is_set_aside_with_its_description(tmp_p
     for round_ in ("first", "second"):
         csv.write_text(round_)
         json.write_text(round_)
-        with staged_output(tmp_path, inputs=(csv, json), outdated=("plan.*",)) as stage:
-            (stage / "plan.csv").write_text("new")
-            (stage / "plan.json").write_text("new")
+        write(tmp_path, {"plan.csv": "new", "plan.json": "new"}, inputs=(csv, json))
         assert csv.read_text() == json.read_text() == "new"
     kept = {p.name: p.read_text() for p in tmp_path.glob("plan_kept*")}
     assert kept == {
@@ -124,6 +197,7 @@ def test_a_sensor_that_reads_in_another_unit_is_refused(verb, sensor_file, recor
 
 
 def test_a_search_does_not_replace_the_sensor_that_it_was_given(sensor_file, tmp_path, quick_frames, capsys):
+    sensor_file.write_text(sensor_file.read_text() + "\n")  # which the search would not write
     before = sensor_file.read_bytes()
     words = ("--sensor", sensor_file, "--truth", "500,250,90", "--trust", 1, "--max-readings", 1, "--out", tmp_path)
     assert main([str(word) for word in ("explore", *words)]) == 0
@@ -140,19 +214,6 @@ def test_a_calibration_does_not_replace_the_description_of_its_recording(recordi
     assert main([str(word) for word in words]) == 0
     assert (tmp_path / "sensor_kept.json").read_bytes() == before
     assert "sensor_kept.json" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("header", ["x_mm,reading", "x_mm, reading", '"x_mm","reading"', "\nx_mm,reading"])
-def test_readings_are_seen_under_any_header_that_a_recording_may_have(header, tmp_path):
-    table = tmp_path / "next_plan.csv"
-    assert not holds_readings(table, "reading")
-    table.write_text(f"{header}\n1,\n2,\n")
-    assert not holds_readings(table, "reading")
-    table.write_text(f"{header}\n1,\n2,40\n")
-    assert holds_readings(table, "reading")
-    assert not holds_readings(table, "level")
-    table.write_text(f"{header}\n1\n2,40\n")
-    assert holds_readings(table, "level"), "a table that cannot be read is not replaced"
 
 
 @pytest.mark.slow
@@ -175,28 +236,25 @@ def test_readings_filled_in_where_the_plan_stood_are_not_lost(recording_file, tm
     assert "sensor_kept.json" in capsys.readouterr().out
 
 
-NEW = {"a.txt": "new", "plan.csv": "new", "plan.json": "new", "sub/c.txt": "new"}
-OLD = {"a.txt": "old", "plan.csv": "read", "plan.json": "read", "witness_1.svg": "old"}
-DONE = {**NEW, "plan_kept.csv": "read", "plan_kept.json": "read"}
+NEW = {"a.txt": "new", "plan.csv": "new", "plan.json": "new", "sub/c.txt": "new", "same.txt": "same"}
+OLD = {"same.txt": "same", "a.txt": "old", "plan.csv": "read", "plan.json": "old", "witness_1.svg": "old"}
+DONE = {**NEW, "plan_kept.csv": "read", "plan_kept.json": "old"}
 
 
 def contents(folder):
-    """Return what files hold, by name, but for the lock file."""
-    files = [p for p in folder.rglob("*") if p.is_file() and p.name != ".results.lock"]
+    """Return what files hold, by name, but for the lock file and the list of results."""
+    files = [
+        p for p in folder.rglob("*") if p.is_file() and not p.name.startswith((".results.lock", ".probewise-written"))
+    ]
     return {p.relative_to(folder).as_posix(): p.read_text() for p in files}
 
 
 def write_new(out):
-    with staged_output(out, inputs=(out / "plan.csv", out / "plan.json"), outdated=("witness_*.svg",)) as stage:
-        (stage / "sub").mkdir()
-        for name, text in NEW.items():
-            write_text_atomically(stage / name, text)
+    write(out, NEW, inputs=(out / "plan.csv",))
 
 
 def write_abc(out):
-    with staged_output(out) as stage:
-        for name in "abc":
-            (stage / name).write_text("new")
+    write(out, dict.fromkeys("abc", "new"))
 
 
 def killed_at(n, write, out):
@@ -222,9 +280,7 @@ def test_wherever_a_command_is_killed_the_next_one_finds_all_of_its_files_or_non
     settled = []
     for n in itertools.count():
         out = tmp_path / str(n)
-        out.mkdir()
-        for name, text in OLD.items():
-            (out / name).write_text(text)
+        write(out, OLD)
         if not killed_at(n, write_new, out):
             break
         with pytest.raises(ZeroDivisionError), staged_output(out):
@@ -249,8 +305,7 @@ def test_a_file_that_cannot_be_replaced_is_put_in_place_by_the_next_command(tmp_
         write_abc(tmp_path)
     assert (tmp_path / "a").exists()
     monkeypatch.undo()
-    with staged_output(tmp_path):
-        pass
+    write(tmp_path, {}, adds=True)
     assert contents(tmp_path) == dict.fromkeys("abc", "new")
 
 

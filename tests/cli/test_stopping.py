@@ -20,10 +20,10 @@ from probewise._signals import (
     reporting_what_is_kept,
     stoppable,
 )
+from probewise._writing import staged_output
 from probewise.arm import LegoArm, Pose, read_geometry, shipped_geometry_path
 from probewise.arm.nxt import Brick, BrickMachine, Link
 from probewise.cli import main
-from probewise.cli.explore import remove_earlier_results
 from probewise.emulator import VirtualClock, VirtualLine, set_up_bench
 from probewise.emulator import read_geometry as read_numbers
 from probewise.errors import LinkError
@@ -216,7 +216,7 @@ def test_a_drawing_that_swallows_a_signal_stops_the_run_all_the_same(
     out = tmp_path / "out"
     assert main(command(sensor_file, out)) == 128 + signal.SIGTERM
     assert "keeps 1 reading; go on with" in capsys.readouterr().err
-    assert sorted(p.name for p in out.iterdir()) == [".journal.jsonl.lock", "journal.jsonl"]
+    assert [p.name for p in out.iterdir() if p.name[0] != "."] == ["journal.jsonl"]
 
 
 @pytest.mark.slow
@@ -226,7 +226,7 @@ def test_pictures_of_a_run_whose_journal_is_gone_do_not_mix_with_those_of_the_ne
     (out / "journal.jsonl").unlink()
     (out / "notes.txt").write_text("mine")
     assert main(command(sensor_file, out)) == 0
-    names = {p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file() and p.suffix != ".lock"}
+    names = {p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file() and p.name[0] != "."}
     results = {"report.html", "run.gif", "result.json", "samples.csv", "sensor.json"}
     assert names == {"journal.jsonl", "frames/001.png", "notes.txt"} | results
 
@@ -243,22 +243,14 @@ def test_results_of_an_earlier_run_do_not_stand_beside_a_new_journal_when_it_is_
 
     monkeypatch.setattr(exploration, "robot_view_png", stopped_at_the_second)
     out = tmp_path / "out"
-    out.mkdir()
-    for name in ("result.json", "samples.csv", "report.html", "notes.txt"):
-        (out / name).write_text("old")
-    (out / "sensor.json").write_text(sensor_file.read_text())
+    with staged_output(out) as stage:
+        for name in ("result.json", "samples.csv", "report.html", "sensor.json"):
+            stage.write(name, sensor_file.read_text())
+    (out / "notes.txt").write_text("mine")
     words = command(out / "sensor.json" if is_input else sensor_file, out, "--max-readings", 2)
     assert main(words) == 128 + signal.SIGTERM
-    left = {p.name for p in out.iterdir() if p.suffix != ".lock"}
+    left = {p.name for p in out.iterdir() if p.name[0] != "."}
     assert left == {"journal.jsonl", "frames", "notes.txt"} | ({"sensor.json"} if is_input else set())
-
-
-def test_a_sensor_file_without_results_beside_it_is_no_earlier_result(sensor_file, tmp_path):
-    out = tmp_path / "out"
-    out.mkdir()
-    (out / "sensor.json").write_text(sensor_file.read_text())
-    remove_earlier_results(out, ())
-    assert (out / "sensor.json").exists()
 
 
 @pytest.mark.slow

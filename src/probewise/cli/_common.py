@@ -8,10 +8,11 @@ import os
 import shlex
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
+from probewise._words import count_with_noun
 from probewise._writing import Drawings
 from probewise.errors import ProbewiseError, printable, shown
 
@@ -90,12 +91,17 @@ def error_in_one_line(error: Exception) -> str:
     return " ".join(str(error).split())
 
 
-def message_to_resume(path: Path, n: int, noun: str, arguments: argparse.Namespace, *options: str, of: int = 1) -> str:
-    """Return how many of a `noun` (`of` a total) a file holds, and the command, with `options`, that resumes."""
+def message_to_resume(
+    path: Path, count: Callable[[], int], noun: str, arguments: argparse.Namespace, *options: str, of: int = 1
+) -> str:
+    """Return how many of a `noun` (`of` a total) a file holds, if it is there, and the command that resumes."""
+    if not path.exists():
+        return "nothing was written"
     words = [*arguments.words, *(option for option in options if option not in arguments.words)]
     command = (subprocess.list2cmdline if os.name == "nt" else shlex.join)(["probewise", *words])
-    count = f"{n} of {of} {noun}s" if of > 1 else f"{n} {noun}{'' if n == 1 else 's'}"
-    return f"{path} keeps {count}; go on with: {command}"
+    n = count()
+    kept = f"{n} of {of} {noun}s" if of > 1 else count_with_noun(n, noun)
+    return f"{path} keeps {kept}; go on with: {command}"
 
 
 def note_if_replaced(out: Path) -> list[str]:

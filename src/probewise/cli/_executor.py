@@ -12,6 +12,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import AbstractContextManager
+from functools import partial
 from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -49,20 +50,15 @@ def run_and_report(
 
     out: Path = arguments.out
     out.mkdir(parents=True, exist_ok=True)
-    main = table if (out / file).exists() else ""  # before the first run nothing there is of an earlier one
 
-    def kept() -> str:
-        if not (out / file).exists():
-            return "nothing was written"
-        n_done = len(read_campaign(out / file).results)
-        return message_to_resume(out / file, n_done, campaign.noun.removesuffix("s"), arguments)
-
+    noun, n_done = campaign.noun.removesuffix("s"), lambda: len(read_campaign(out / file).results)
+    kept = partial(message_to_resume, out / file, n_done, noun, arguments)
     with reporting_what_is_kept(kept), progress_of(arguments) as progress, open_executor(arguments) as executor:
         results = campaign.run(path=out / file, executor=executor, progress=progress)
     drawings = Drawings(out)
     with reporting_what_is_kept(kept, results=True), progress_of(arguments) as progress:
         page = page_of(results)
-        made = Output(lambda stage: stage.write(table, page.table), {}, lambda _: page.html(drawings.draw), main=main)
+        made = Output(lambda stage: stage.write(table, page.table), {}, lambda _: page.html(drawings.draw))
         drawings.write_results(made, progress=progress)
     return finish(arguments, drawings, page.sentence, f"{said}written to {out}")
 

@@ -19,7 +19,6 @@ from probewise.cli._options import SHIPPED
 from probewise.errors import FileError, ParameterError
 from probewise.progress import Progress, silent
 from probewise.recordings.io import parse_strict_json
-from probewise.recordings.table import read_table
 
 if TYPE_CHECKING:
     from probewise.calibration import FittedSensor
@@ -48,22 +47,6 @@ def tables_and_descriptions(tables: Sequence[Path]) -> list[Path]:
             patterns = parse_strict_json(files[-1].read_bytes() if files[-1].is_file() else b"")["patterns"].values()
             files += [table.parent / pattern["file"] for pattern in patterns if "file" in pattern]
     return files
-
-
-def inputs_and_filled_in_plan(inputs: Sequence[Path], plan: Path, column: str = "reading") -> list[Path]:
-    """List files that results must not replace: inputs, and an earlier advised plan with readings in a column."""
-    return tables_and_descriptions([*inputs, *([plan] if holds_readings(plan, column) else [])])
-
-
-def holds_readings(table: Path, column: str) -> bool:
-    """Return whether a table has readings in this column, or cannot be read, so that it must not be replaced."""
-    if not table.is_file():  # a named pipe would be waited for
-        return False
-    try:
-        rows = read_table(table, wanted=(column,))
-    except FileError:
-        return True
-    return column in rows.columns and any(rows.columns[column])
 
 
 # A user's simulator and its tables

@@ -165,37 +165,27 @@ def refuse_options(arguments: argparse.Namespace, what: str, *names: str) -> Non
 
 # Options that several verbs have
 
+_SIMULATOR = (
+    "a simulator of your own; the file says which columns of the table it reads (it is a program: run only those that "
+    "you trust)"
+)
+_ORIGIN = "where on the field the plan's origin lies (default: the field's middle; with FILE.py 0,0"
+_GEOMETRY = "the arm as built: lengths, gears, ports, limits (default: the file that ships"
 _FILE: dict[str, Any] = {"type": parse_path}
 _WORKERS: dict[str, Any] = {"type": _count_up_to(MOST_WORKERS), "default": 1}
 _SHARED: dict[str, tuple[str, dict[str, Any]]] = {
-    "--out DIR": (
-        "directory for the results; made if missing, results of an earlier run there are replaced",
-        _FILE | {"required": True},
-    ),
-    "--seed N": (
-        f"seed of all randomness, printed with the result (default {DEFAULT_SEED})",
-        {"type": _seed, "default": DEFAULT_SEED},
-    ),
+    "--out DIR": ("directory for the results, made if missing; earlier ones are replaced", _FILE | {"required": True}),
+    "--seed N": (f"seed of all randomness, printed (default {DEFAULT_SEED})", {"type": _seed, "default": DEFAULT_SEED}),
     "--quiet": ("no progress and no summary; errors still show", {}),
     "--nested-stop": (
         "when nested sampling ends with --method paper: at a change of log evidence below 1e-8 (default), or "
         "where the log evidence can rise by 0.05 at most",
         {"choices": ("change", "remaining")},
     ),
-    "--simulator FILE.py": (
-        "a simulator of your own instead of the light sensor; the file says which columns of the table it reads (it "
-        "is a program: run only those that you trust)",
-        _FILE,
-    ),
-    "--workers N": (
-        "processes for a simulator that is called for one sample at a time (default 1); results are the same",
-        _WORKERS,
-    ),
+    "--simulator FILE.py": (f"in place of the light sensor {_SIMULATOR}", _FILE),
+    "--workers N": ("processes for a simulator of one sample at a time (default 1); results are the same", _WORKERS),
     "--arm ARM": (f"where the readings come from: {ARMS} (default simulated)", {"default": "simulated"}),
-    "--geometry ARM.toml": (
-        "the arm as built: lengths, gears, ports, limits (default: the file that ships)",
-        _FILE,
-    ),
+    "--geometry ARM.toml": (f"{_GEOMETRY})", _FILE),
     "--sensor S.json": ("an earlier calibration, whose posterior becomes the prior", _FILE),
 }
 
@@ -242,10 +232,9 @@ def _calibrate(to: argparse.ArgumentParser) -> None:
     about = f"live points where a number of Gaussians is searched in full (default {N_LIVE})"
     add(to, "--live N", about, type=_count, default=N_LIVE)
     about = (
-        "quick (default): samples from the peaks of the likelihood, until the evidence has clearly fallen, one "
-        "search of the prior that vouches; full: the whole prior of every number of Gaussians is searched by nested "
-        "sampling, and each evidence refined by importance sampling; paper: uniform priors, evidence by nested "
-        "sampling alone"
+        "quick (default): samples from the peaks of the likelihood, and one search of the prior that vouches; full: "
+        "nested sampling of the whole prior of every number of Gaussians, its evidence refined by importance sampling; "
+        "paper: uniform priors, evidence by nested sampling alone"
     )
     add(to, "--method", about, choices=("quick", "full", "paper"), default=CALIBRATION)
     add(to, "--nested-stop")
@@ -268,16 +257,12 @@ def _explore(to: argparse.ArgumentParser) -> None:
     add(to, "--out DIR")
     add(to, "--model", "the robot's sensor model", choices=("ssf", "naive"), default=MODEL)
     about = (
-        "method of inference and choice: posterior samples reweighted after each reading (particles, default), or "
-        "the paper's: a new nested sampling run after each reading, 50 diversified samples, entropy of their "
-        "predictions, a Student-t or naive likelihood"
+        "particles (default): posterior samples, reweighted after each reading; paper: nested sampling after each "
+        "reading, entropy of 50 diversified samples' predictions, a Student-t or naive likelihood"
     )
     add(to, "--method", about, choices=("particles", "paper"), default=METHOD)
     add(to, "--nested-stop")
-    about = (
-        "recording with readings over black and over white, from which the naive model of --method paper takes "
-        "its levels and sds (a simulated arm reads both before it starts)"
-    )
+    about = "readings over black and white, for the naive model of --method paper (a simulated arm takes its own)"
     add(to, "--levels REC.csv", about, type=parse_path)
     about = f"possible shapes on the field, one or several of %(choices)s (default {SHAPE})"
     add(to, "--shape SHAPE", about, nargs="+", choices=SHAPES, default=[SHAPE])
@@ -285,36 +270,29 @@ def _explore(to: argparse.ArgumentParser) -> None:
     add(to, "--truth [SHAPE:]V,V,...", about)
     add(to, "--field W,H", "width and height of the field in mm (default: the geometry's, or 1048,520)")
     add(to, "--arm ARM")
-    about = (
-        "the arm as built: lengths, gears, ports, limits (default: the file that ships; the simulated arm has its "
-        "reach, and a sensor that turns with --orientations alone)"
-    )
+    about = f"{_GEOMETRY}; the simulated arm has its reach, and a sensor that turns with --orientations alone)"
     add(to, "--geometry ARM.toml", about, type=parse_path)
     about = f"largest number of readings (default {MAX_READINGS})"
     add(to, "--max-readings N", about, type=_count, default=MAX_READINGS)
     add(to, "--live", "show the robot's view in a browser while it works (DIR/live.html)")
     add(to, "--both-models", "also show the posterior of the other sensor model from the same readings")
     about = (
-        f"acquisition function: {UTILITY} (default), information and, near the end, the probability that the "
-        "reading ends the run; information alone; the paper's entropy; information per-second of arm time, "
-        "information about:PARAMETER such as about:radius_mm, or on which-shape of several is present"
+        f"what a reading is worth: {UTILITY} (default), information and, near the end, the probability that it ends "
+        "the run; information; the paper's entropy; information per-second, about:PARAMETER (about:radius_mm), or on "
+        "which-shape of several is there"
     )
     add(to, "--utility NAME", about)
     add(
         to,
         "--learn-sensor",
-        "infer the SSF's size and place and both levels together with the shape, with sensor.json as prior",
+        "infer the SSF's size and place and both levels too, with the sensor as their prior",
     )
     about = (
-        "prior probability that the sensor model leaves nothing out; below 1 the robot also infers which effects "
-        "it leaves out (default 0.9; 1 with --model naive, --method paper, --learn-sensor, any --utility but "
-        "finishing, or several shapes)"
+        "prior probability that the sensor model leaves nothing out; below 1 what it leaves out is inferred too ("
+        "default 0.9; 1 with --model naive, --method paper, --learn-sensor, another --utility, or several shapes)"
     )
     add(to, "--trust P", about, type=float)
-    about = (
-        "a card that lies on the field, its centre and size in mm, its albedo from 0 (as the field) to 1 (as the "
-        "shape); may be given again"
-    )
+    about = "a card on the field: centre and size in mm, albedo from 0 (field) to 1 (shape); may be given again"
     add(to, "--reference X,Y,W,H,ALBEDO", about, action="append", default=[])
     add(to, "--batch N", "choose N readings at a time", type=_count_up_to(MOST_BATCH), default=1)
     more = to.add_argument_group("more than a place", "further choices, for an arm that supports them")
@@ -331,18 +309,15 @@ def _study(to: argparse.ArgumentParser) -> None:
     add(to, "--circles N", "circles per row, always the first ones (default 200)", type=circles, default=200)
     add(to, "--quoted N", "circles of the first row (default as --circles)", type=circles)
     about = (
-        "conceal an effect from the robot in every row, at three sizes, and search for the same circles with and "
-        "without doubt about the sensor (writes report.html and concealed.csv; replaces all other rows)"
+        "conceal an effect in every row, at three sizes; search for the same circles with and without doubt about the "
+        "sensor (writes concealed.csv; replaces all other rows)"
     )
     add(to, "--concealed", about)
     add(to, "--seed S", "with --concealed: circles, noise and robot of another seed", type=_seed)
     add(to, "--size", "with --concealed: only this one of the three sizes", choices=SIZES)
     add(to, "--varied", "with --concealed: over each circle a noise, a pace, a rounding and a sensor of its own")
     add(to, "--clean N", "with --concealed: circles of the row without a concealed effect", type=circles)
-    about = (
-        "for each sensor model, our method and the paper's (explore --method paper) on the same circles; of the "
-        "options of one row, only --population and --nested-stop apply"
-    )
+    about = "both sensor models and methods on the same circles, with --population and --nested-stop of one row"
     add(to, "--beside-paper", about)
     one = to.add_argument_group("one row instead of the table's", "defaults are those of the reference row")
     add(one, "--population NAME", "inside (50 to 150 mm, entirely in the field) or anywhere")
@@ -366,32 +341,26 @@ def _audit(to: argparse.ArgumentParser) -> None:
     add(to, "--sensor S.json", "the calibrated sensor (default: a typical one)", type=parse_path)
     add(to, "--simulator FILE.py")
     add(to, "--workers N")
-    about = (
-        "directory for audit.json, audit.png, report.html and (without --simulator) cure_plan.csv; by default only the "
-        "text is printed"
-    )
+    about = "directory for audit.json, report.html and, of a light sensor, cure_plan.csv (default: only text)"
     add(to, "--out DIR", about, type=parse_path)
     add(to, "--quiet")
 
 
 def _diagnose(to: argparse.ArgumentParser) -> None:
     about = (
-        "recording, its JSON beside it, or paper or concealed, which ship, or the journal.jsonl of an explore "
-        "run; with --simulator any table; several are diagnosed together"
+        "recording, its JSON beside it; or paper or concealed, which ship; or an explore run's journal.jsonl; with "
+        "--simulator any table; several are diagnosed together"
     )
     add(to, "recordings REC.csv", about, type=_recording, nargs="+")
     about = "an earlier calibration, whose posterior becomes the prior (default with a journal: the one of its run)"
     add(to, "--sensor S.json", about, type=parse_path)
     add(to, "--simulator FILE.py")
     about = (
-        "compute the evidence of the leading hypotheses by nested sampling too; it replaces the Laplace "
-        "approximation where they differ by more than one nat plus its standard error and no run gives a warning"
+        "compute the evidence of the leading hypotheses by nested sampling too, which replaces Laplace's approximation "
+        "where they differ by more than a nat plus its standard error, unless a run gives a warning"
     )
     add(to, "--thorough", about)
-    about = (
-        "diagnose each recording by itself, into a folder of its name; table.csv and report.html sort them by "
-        "what ails them; the same command resumes"
-    )
+    about = "each recording by itself, into a folder of its name; table.csv and report.html sort them; it resumes"
     add(to, "--each", about)
     _add_executor(to)
     add(to, "--out DIR")
@@ -402,17 +371,11 @@ def _investigate(to: argparse.ArgumentParser) -> None:
     add(to, "--arm ARM")
     about = f"the first plan: a plan or recording, its JSON beside it; or {' or '.join(SHIPPED)}, which ship"
     add(to, "--plan PLAN.csv", about, required=True)
-    about = (
-        "where on the field the plan's origin lies (default: the field's middle; with FILE.py 0,0; none with simulated)"
-    )
-    add(to, "--origin-mm X,Y", about)
+    add(to, "--origin-mm X,Y", f"{_ORIGIN}; none with simulated)")
     add(to, "--geometry ARM.toml")
     add(to, "--out DIR")
     add(to, "--sensor S.json")
-    about = (
-        "effect concealed in the simulated world, such as backlash:0.5 or nothing; several joined by + (default: "
-        "one effect drawn from the seed, named at the end)"
-    )
+    about = "effects concealed in the simulated world: nothing, or backlash:0.5, joined by + (default: one drawn)"
     add(to, "--truth NAME:V,V", about)
     about = "largest number of readings beyond the first plan (default 400)"
     add(to, "--readings N", about, type=_count, default=400)
@@ -426,11 +389,7 @@ def _investigate(to: argparse.ArgumentParser) -> None:
 
 def _fit(to: argparse.ArgumentParser) -> None:
     add(to, "tables DATA.csv", "table of readings; several are fitted together", type=parse_path, nargs="+")
-    about = (
-        "a simulator of your own; the file says which columns of the table it reads (it is a program: run only those "
-        "that you trust)"
-    )
-    add(to, "--simulator FILE.py", about, type=parse_path)
+    add(to, "--simulator FILE.py", _SIMULATOR, type=parse_path)
     add(to, "--workers N")
     add(to, "--thorough", "compute the evidence by nested sampling as well")
     add(to, "--out DIR")
@@ -439,17 +398,11 @@ def _fit(to: argparse.ArgumentParser) -> None:
 
 def _challenge(to: argparse.ArgumentParser) -> None:
     add(to, "--out DIR")
-    about = (
-        "number of recordings, always the first of the seed; 60 give one case of each kind, 6000 the whole table "
-        "(default 60)"
-    )
+    about = "number of recordings, the seed's first; 60 (default) give a case of each kind, 6000 the whole table"
     add(to, "--cases N", about, type=_count, default=60)
     about = "recordings of twelve kinds of system, each with its simulator's file, instead of a light sensor's"
     add(to, "--systems", about)
-    about = (
-        "take the readings that the diagnosis advises until it is settled, N rounds at most (default 1: no further "
-        "readings)"
-    )
+    about = "take the readings that the diagnosis advises until it is settled, in N rounds at most (default 1: none)"
     add(to, "--rounds N", about, type=_count, default=1)
     _add_executor(to)
     _add_seed_and_quiet(to)
@@ -532,8 +485,7 @@ def _arm(to: argparse.ArgumentParser) -> None:
     record = task("record", summary, arms=_ALL_ARMS)
     add(record, "plan PLAN.csv", f"plan or recording, its JSON beside it; or {' or '.join(SHIPPED)}, which ship")
     add(record, "--out REC.csv", "where the recording goes", type=parse_path, required=True)
-    about = "where on the field the plan's origin lies (default: the field's middle; with FILE.py 0,0)"
-    add(record, "--origin-mm X,Y", about)
+    add(record, "--origin-mm X,Y", f"{_ORIGIN})")
     own = record.add_argument_group("with FILE.py", "properties of the readings, if not in the plan's JSON")
     add(own, "--unit UNIT", "unit of a reading, such as V or counts")
     add(own, "--range LOW,HIGH", "smallest and largest possible reading, such as 0,1023")

@@ -66,12 +66,10 @@ def record_plan(arguments: argparse.Namespace, geometry: Geometry) -> None:
         taken = _earlier_readings(out, plan, resume=arguments.resume, is_lego=chosen is None or chosen.is_lego)
 
     def kept_message() -> str:
-        if not out.exists():
-            return "nothing was read"
         if at_end:
             return f"nothing was kept: {out} takes whole recordings"
-        n_kept = len(_read_unfinished_recording(out))
-        return message_to_resume(out, n_kept, "reading", arguments, "--resume", of=len(plan))
+        resume = partial(message_to_resume, out, lambda: len(_read_unfinished_recording(out)), "reading")
+        return resume(arguments, "--resume", of=len(plan))
 
     start_s = taken[-1].time_s if taken else 0.0
     instrument, bench = _bench.open_instrument(arguments, geometry, start_s=start_s, n_taken=len(taken))

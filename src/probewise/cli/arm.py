@@ -289,10 +289,7 @@ def _touch_and_save_marks(arguments: argparse.Namespace, geometry: Geometry, kep
     instrument, bench = _bench.open_instrument(arguments, geometry, watched=True)
     assert isinstance(instrument, LegoArm)
 
-    def kept_message() -> str:
-        resume = partial(message_to_resume, kept, len(taken), "mark", arguments, "--resume")
-        return resume() if kept.exists() else "no mark was kept"
-
+    kept_message = partial(message_to_resume, kept, taken.__len__, "mark", arguments, "--resume")
     with reporting_what_is_kept(kept_message), instrument as arm:
         answer, tell = _bench.prompter_for_answer(arm), print_result if bench is None else lambda text: None
         if bench is None:

@@ -6,9 +6,8 @@ from probewise import diagnosis
 from probewise._writing import Drawings, checked_output_directory
 from probewise.calibration import read_sensor
 from probewise.cli._common import finish, progress_of, say
-from probewise.cli._inputs import inputs_and_filled_in_plan, open_simulator, read_or_shipped_plan, refuse_journal
+from probewise.cli._inputs import open_simulator, read_or_shipped_plan, refuse_journal, tables_and_descriptions
 from probewise.cli._options import refuse_options
-from probewise.diagnosis import CURE_PLAN
 from probewise.report.audit import output_of
 from probewise.systems import read_table_for
 
@@ -29,8 +28,7 @@ def run(arguments: argparse.Namespace) -> int:
             sensor = None if arguments.sensor is None else read_sensor(arguments.sensor)
             audit = diagnosis.audit_plan(plan, sensor=sensor, progress=progress)
         if drawings is not None:
-            inputs = inputs_and_filled_in_plan([arguments.plan], drawings.out / CURE_PLAN)
-            made = output_of(audit, source=arguments.plan.name)
+            made, inputs = output_of(audit, source=arguments.plan.name), tables_and_descriptions([arguments.plan])
             drawings.write_results(made, inputs=inputs, progress=progress)
     say(arguments, audit.summary(), *(f"note: {note}" for note in getattr(audit.plan, "notes", ())))
     return 0 if drawings is None else finish(arguments, drawings, f"written to {drawings.out}")

@@ -8,12 +8,13 @@ import time
 from concurrent.futures import as_completed
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from probewise import diagnosis as engine
-from probewise._writing import PAGE, Drawings, StagedFiles, checked_output_directory, staged_output
+from probewise._writing import Drawings, Output, StagedFiles, checked_output_directory
 from probewise.arm import Pose, read_geometry, shipped_geometry_path
 from probewise.calibration import FittedSensor, calibrate, predict, write_sensor
 from probewise.cli._common import progress_of, say
@@ -46,25 +47,21 @@ _CIRCLE = Circle(radius_mm=(50.0, 150.0), inside=True)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the demo, print its summary, and return the exit status."""
+    """Calibrate, search and diagnose, write all files, and print the summary; return the exit status."""
     out = checked_output_directory(arguments.out, main="answers.json")
-    drawings = (Drawings(out), Drawings(out / DIAGNOSIS))
     with progress_of(arguments) as progress:
-        lines = run_demo(*drawings, seed=arguments.seed, full=arguments.full, progress=progress)
+        drawings, lines = _run_demo(out, seed=arguments.seed, full=arguments.full, progress=progress)
     say(arguments, *lines)
     for each in drawings:
         each.raise_if_any_failed()
     return 0
 
 
-def run_demo(
-    drawings: Drawings, drawings_of_diagnosis: Drawings, *, seed: int, full: bool, progress: Progress
-) -> tuple[str, ...]:
-    """Calibrate, search and diagnose, write all files, and return the lines to print."""
+def _run_demo(out: Path, *, seed: int, full: bool, progress: Progress) -> tuple[list[Drawings], list[str]]:
     from probewise.report import demo as report  # here, as the processes that search import this file and draw nothing
     from probewise.report.diagnosis import output_of
 
-    started, out = time.monotonic(), drawings.out
+    started = time.monotonic()
     drawn_truth = _CIRCLE.prior.from_unit_cube(np.random.default_rng([seed, 0]).random((1, 3)))[0]
     truth, doing = tuple(drawn_truth.tolist()), "calibrating, searching and diagnosing"
     with worker_pool(2) as pool:
@@ -86,7 +83,6 @@ def run_demo(
         for done, future in enumerate(as_completed(parts), start=2):
             future.result()
             progress(doing, done, 6)
-    progress("writing the results")
     diagnosis, prediction = diagnosing.result(), predict(sensor, recording.plan, recording.readings)
     means, known = sensor.mean(), dict(zip(_CIRCLE.prior.names, truth, strict=True))
     outline_mm, levels = outlines(_CIRCLE.region(np.array([truth])))[0], (means["I_min"], means["I_max"])
@@ -99,24 +95,25 @@ def run_demo(
     found = report.DemoRun(calibration, recording, prediction, searches, doubted, diagnosis, geometry, concealed, seed)
     figures, made = report.figure_drawers(found), output_of(diagnosis, seed=seed, source="concealed.csv")
     seconds = time.monotonic() - started
-    in_its_folder = (f"{DIAGNOSIS}/{name}" for name in (*made.drawers, PAGE))
-    with staged_output(out, drawn=(*figures, PAGE, *in_its_folder), main="answers.json") as stage:
+
+    def write_files(stage: StagedFiles) -> None:
         write_sensor(sensor, stage / "sensor.json")
-        (stage / DIAGNOSIS).mkdir()
-        made.files(StagedFiles(stage / DIAGNOSIS))
         answers = report.main_findings_by_key(found)
         stage.write("answers.json", json.dumps(answers, indent=1, ensure_ascii=False) + "\n")
 
-    drawings_of_diagnosis.write_report(made.drawers, made.page, progress=progress)
-    drawings.write_report(figures, partial(report.page_html, found, seconds=seconds), progress=progress)
-    return (
+    page = partial(report.page_html, found, seconds=seconds)
+    drawings = [Drawings(out / DIAGNOSIS), Drawings(out)]
+    for each, output in zip(drawings, (made, Output(write_files, figures, page, "answers.json")), strict=True):
+        each.write_results(output, progress=progress)
+    return drawings, [
+        *dict.fromkeys(note for each in drawings for note in each.notes),
         *(f"{s.model} robot: {s.n} readings, off by {s.largest_error_mm:.1f} mm" for s in searches),
         report.summary_sentence(searches),
         f"diagnosis of the second recording: {diagnosis.verdict}, "
         f"{' + '.join(diagnosis.combination) or 'nothing'}; concealed was: {found.concealed}",
         f"a concealed saturation: {report.doubt_sentence(doubted)}",
         f"seed {seed}; {seconds:.0f} s; written to {out / 'report.html'}",
-    )
+    ]
 
 
 def _search(

@@ -20,20 +20,19 @@ from probewise import diagnosis as engine
 from probewise._signals import reporting_what_is_kept
 from probewise._tasks import results_as_tasks_end
 from probewise._version import __version__
-from probewise._writing import PAGE, Drawings, Output, checked_output_directory, staged_output
+from probewise._writing import PAGE, Drawings, Output, checked_output_directory
 from probewise.calibration import read_sensor
 from probewise.cli._common import CommandError, error_in_one_line, finish, message_to_resume, progress_of
 from probewise.cli._executor import open_executor
 from probewise.cli._inputs import (
     find_journal_sensor_file,
-    inputs_and_filled_in_plan,
     is_journal,
     journal_recording_and_shape,
     open_simulator,
     read_joined_table,
+    tables_and_descriptions,
 )
 from probewise.cli._options import parser, refuse_options
-from probewise.diagnosis import NEXT_PLAN
 from probewise.errors import ParameterError, PipeWarning, ProbewiseError, require
 from probewise.progress import Progress
 from probewise.recordings import Recording, read_recording
@@ -46,7 +45,6 @@ if TYPE_CHECKING:
 
 _INPUTS = "inputs.sha256"  # of the recording, its description, sensor and simulator, and the options
 _OF_ALL = ("table.csv", "counts.svg", PAGE)
-_OUTDATED = ("witness_*.svg", "gain.svg", "next.csv", NEXT_PLAN, "next_plan.json")  # not in every diagnosis
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -75,7 +73,6 @@ def run(arguments: argparse.Namespace) -> int:
             )
             notes = (*diagnosis.recording.notes, *engine.notes_on_calls(diagnosis))
             read = [*arguments.recordings, arguments.simulator]
-            advised, column = "next.csv", simulator.reading
         else:
             recordings, sensor, shape = _read_inputs(arguments, progress=progress)
             joined = engine.join(recordings)
@@ -89,10 +86,8 @@ def run(arguments: argparse.Namespace) -> int:
                 diagnosis = diagnosis.with_shape_in_next_plan(null.shape)
             notes = joined.notes
             read = [*arguments.recordings, *([] if arguments.sensor is None else [arguments.sensor])]
-            advised, column = NEXT_PLAN, "reading"
         made = output_of(diagnosis, seed=arguments.seed, source=source)
-        inputs = inputs_and_filled_in_plan(read, drawings.out / advised, column)
-        drawings.write_results(made, inputs=inputs, progress=progress)
+        drawings.write_results(made, inputs=tables_and_descriptions(read), progress=progress)
     summary = f"{diagnosis.summary()}\nseed {arguments.seed}; written to {drawings.out}"
     return finish(arguments, drawings, *(f"note: {n}" for n in notes), summary)
 
@@ -148,9 +143,7 @@ def _diagnose_each(arguments: argparse.Namespace) -> int:
     read = [*arguments.recordings, *(path for _, path in given if path is not None)]
     n_before, refused, notes = len(files) - len(words), dict[str, str](), list[str]()
 
-    def kept() -> str:
-        return message_to_resume(out, sum(map(is_done, files)), "recording", arguments, of=len(files))
-
+    kept = partial(message_to_resume, out, lambda: sum(map(is_done, files)), "recording", arguments, of=len(files))
     with (
         reporting_what_is_kept(kept),
         progress_of(arguments) as progress,
@@ -161,14 +154,11 @@ def _diagnose_each(arguments: argparse.Namespace) -> int:
         for done, (name, (message, results)) in enumerate(ended, start=n_before + 1):
             if results:
                 results[_INPUTS] = fingerprints[name].encode()
-                advised, column = NEXT_PLAN, "reading"
-                if "repaired.json" in results:
-                    advised, column = "next.csv", json.loads(results["repaired.json"])["simulator"]["reading"]
-                inputs = inputs_and_filled_in_plan(read, out / name / advised, column)
-                with staged_output(out / name, inputs=inputs, outdated=_OUTDATED, main="diagnosis.json") as stage:
+                drawings = Drawings(out / name)
+                with drawings.staged("diagnosis.json", inputs=tables_and_descriptions(read), adds=False) as stage:
                     for file, content in results.items():
                         stage.write(file, content)
-                notes += [f"note: what was {path} is now {now}" for path, now in stage.kept.items()]
+                notes += drawings.notes
             if message:
                 refused[name] = message
             progress("diagnosing", done, len(files), name)

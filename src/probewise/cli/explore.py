@@ -9,6 +9,7 @@ import webbrowser
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -24,24 +25,24 @@ from probewise.calibration import FittedSensor, read_sensor, write_sensor
 from probewise.cli import _bench
 from probewise.cli._common import finish, message_to_resume, progress_of, say
 from probewise.cli._inputs import read_or_shipped_geometry, tables_and_descriptions
-from probewise.cli._options import parse_numbers, refuse_options
+from probewise.cli._options import parse_finite_numbers, parse_numbers, refuse_options
 from probewise.effects import spoken_name
 from probewise.errors import FileError, ParameterError, did_you_mean, require
 from probewise.experiment import Experiment, Exploration, HiddenShape, ModelName, Step, read_journal
 from probewise.inference import Naive
 from probewise.progress import Progress
-from probewise.recordings import read_recording, shipped, write_bytes_atomically
+from probewise.recordings import read_recording, shipped
 from probewise.report import exploration as report
 from probewise.report.pictures import animated_gif
 from probewise.scene import SHAPES, Card, Field
 from probewise.verbs import DEFAULT_SEED, calibrate, naive_levels
 
-_SHIPPED = "shipped_sensor.json"
+_SHIPPED, _MAIN = "shipped_sensor.json", "result.json"
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Let the robot search; keep a journal and a picture of every step; write the report; return the exit status."""
-    main = "" if arguments.resume else "result.json"  # a run goes on where it is, whatever was written beside it
+    main = "" if arguments.resume else _MAIN  # a run goes on where it is, whatever was written beside it
     out = checked_output_directory(arguments.out, "journal.jsonl", "live.html", "frames", main=main)
     search = Search(arguments)
     journal = out / "journal.jsonl"
@@ -49,28 +50,21 @@ def run(arguments: argparse.Namespace) -> int:
         raise FileError(journal, "no such file", "a journal to resume; omit --resume to begin a new run")
     if journal.exists() and not arguments.resume:
         raise FileError(journal, "this journal exists already", "--resume to continue it, or another --out")
-    written_as_it_goes = (out / name for name in ("frames", *["live.html"] * arguments.live))
-    for path in written_as_it_goes if not arguments.resume and not (out / "result.json").exists() else ():
-        if path.exists():
-            raise FileError(path, "it exists already, and no search is in that folder", "another --out, or none there")
     before = read_journal(journal) if arguments.resume else None
     instrument, about_truth = search.open_arm(() if before is None else before.readings)
     say(arguments, f"seed {arguments.seed}")
     if arguments.sensor is None:
         arguments.sensor = out / _SHIPPED
-        out.mkdir(parents=True, exist_ok=True)
         if search.shipped:
-            write_bytes_atomically(arguments.sensor, search.shipped)
+            search.write(_SHIPPED, search.shipped)
     _bench.confirm_lowering(search.arm, instrument, search.geometry)
     if search.as_built is not None:
         _bench.warn_if_place_sd_large(search.as_built, search.experiment.stop_sd_mm)
     steps, n_before = search.steps, 0 if before is None else len(before.entries)
 
-    def kept_message() -> str:
-        if not journal.exists():
-            return "nothing was read"
-        return message_to_resume(journal, len(read_journal(journal).entries), "reading", arguments, "--resume")
-
+    kept_message = partial(
+        message_to_resume, journal, lambda: len(read_journal(journal).entries), "reading", arguments, "--resume"
+    )
     about = {
         **experiments.sensor_entry(search.sensor, _path_relative_to_folder(out, arguments.sensor)),
         **experiments.geometry_entry(search.geometry),
@@ -230,22 +224,24 @@ class Search:
         levels = self.arguments.levels
         return [self.arguments.sensor, *([] if levels is None else tables_and_descriptions([levels]))]
 
+    def write(self, name: str, content: bytes) -> bytes:
+        """Write a file that is there before the run ends, and return its content."""
+        with self.drawings.staged(_MAIN) as stage:
+            stage.write(name, content)
+        return content
+
     def draw_and_write(self, step: Step, shadow: Step | None) -> None:
         """Draw a step, with the other sensor model's (`shadow`), if any; write a PNG and, with --live, the page."""
         self.steps.append(step)
         if shadow is not None:
             self.shadows.append(shadow)
         if step.number == 1 and not step.replayed:
-            remove_earlier_results(self.out, self.files)
-
-        def write(name: str, content: bytes) -> bytes:
-            (self.out / name).parent.mkdir(exist_ok=True)
-            write_bytes_atomically(self.out / name, content)
-            return content
+            with self.drawings.staged(_MAIN, inputs=self.files, adds=False):
+                pass  # which removes what an earlier run wrote, so that two runs do not mix
 
         def draw_and_write(name: str, drawer: Callable[[], bytes]) -> bytes:
             drawn = self.drawings.draw(name, drawer)
-            return drawn and self.drawings.draw(name, lambda: write(name, drawn))  # a full disk ends no search
+            return drawn and self.drawings.draw(name, lambda: self.write(name, drawn))  # a full disk ends no search
 
         self.frames.append(draw_and_write(f"frames/{step.number:03d}.png", lambda: self._draw_frame(step, shadow)))
         if self.arguments.live and draw_and_write("live.html", lambda: self._live_page(step)) and step.number == 1:
@@ -284,8 +280,8 @@ class Search:
             )
 
         animation = {"run.gif": lambda: animated_gif([frame for frame in self.frames if frame])}
-        made = report.output_of(result, seed=seed)._replace(drawers=animation, page=page, outdated=())
-        self.drawings.write_results(made, inputs=self.files, progress=progress)
+        made = report.output_of(result, seed=seed)._replace(drawers=animation, page=page)
+        self.drawings.write_results(made, inputs=self.files, adds=True, progress=progress)
 
     def closing_lines(self, result: Exploration, journal: Path) -> Iterator[str]:
         """Yield the closing lines: the shape, what its sds leave out, probable sensor faults, and errors if known."""
@@ -328,9 +324,7 @@ def _checked_field(text: str | None, geometry: Geometry | None) -> Field:
     of_arm = None if geometry is None else Field(*geometry.field_mm)
     if text is None:
         return of_arm or Field()
-    numbers = parse_numbers(text)
-    require(len(numbers) == 2, "--field", text, "WIDTH,HEIGHT in mm, such as 1048,520")
-    field = Field(*numbers)
+    field = Field(*parse_finite_numbers("--field", text, 2, "WIDTH,HEIGHT in mm, such as 1048,520"))
     if of_arm not in (None, field):
         raise ParameterError("--field", text, f"{of_arm.width_mm:g},{of_arm.height_mm:g}, the geometry's; or none")
     return field
@@ -340,10 +334,8 @@ def parse_cards(texts: Sequence[str], field: Field) -> tuple[Card, ...]:
     """Parse each "X,Y,WIDTH,HEIGHT,ALBEDO": a card on the field, of known albedo, centred at (X, Y) in mm."""
     cards = []
     for text in texts:
-        numbers = parse_numbers(text)
         allowed = "X,Y,WIDTH,HEIGHT,ALBEDO: centre and size in mm, albedo from 0 to 1, such as 100,80,60,40,1"
-        require(len(numbers) == 5, "--reference", text, allowed)
-        card = Card(*numbers)
+        card = Card(*parse_finite_numbers("--reference", text, 5, allowed))
         low, high = card.corners_mm.min(axis=0), card.corners_mm.max(axis=0)
         on_field = min(low) >= 0 and high[0] <= field.width_mm and high[1] <= field.height_mm
         allowed = f"a card on the field of {field.width_mm:g} x {field.height_mm:g} mm"
@@ -365,20 +357,6 @@ def parse_truth(text: str | None, names: Sequence[str], field: Field, *, rng: np
     wanted = shape.prior.names
     require(len(theta) == len(wanted), "--truth", text, f"{len(wanted)} numbers, {','.join(wanted)}")
     return HiddenShape.from_parameters(name, shape, theta, called=f"--truth {text}")
-
-
-def remove_earlier_results(out: Path, files: Sequence[Path]) -> None:
-    """Remove the results of an earlier run from `out`, but none of `files`, so that two runs do not mix.
-
-    Without a result.json there are none, but perhaps somebody's calibration or files of such names.
-    """
-    spared = {os.path.realpath(path) for path in files}
-    drawn, of_machine = ("report.html", "run.gif", "live.html"), ("samples.csv", "sensor.json", "result.json")
-    names = (*drawn, "frames/[0-9][0-9][0-9].png", *of_machine)
-    for pattern in names if (out / "result.json").exists() else ():
-        for path in out.glob(pattern):
-            if os.path.realpath(path) not in spared:
-                path.unlink()
 
 
 def _path_relative_to_folder(folder: Path, path: Path) -> str:

@@ -17,9 +17,8 @@ from probewise.arm import Reading, RequestToPerson, carry_out
 from probewise.calibration import read_sensor
 from probewise.cli import _bench as benches
 from probewise.cli._common import CommandError, finish, message_to_resume, progress_of, say
-from probewise.cli._inputs import inputs_and_filled_in_plan, read_or_shipped_geometry, read_or_shipped_plan
+from probewise.cli._inputs import read_or_shipped_geometry, read_or_shipped_plan, tables_and_descriptions
 from probewise.cli._options import SHIPPED, parse_place, refuse_options
-from probewise.diagnosis import NEXT_PLAN
 from probewise.errors import ParameterError
 from probewise.investigation import (
     Budget,
@@ -60,9 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
     }
     folder = RoundsFolder(out / "rounds", settings, resume=arguments.resume)
 
-    def kept_message() -> str:
-        return message_to_resume(folder.path, folder.n_readings, "reading", arguments, "--resume")
-
+    kept_message = partial(message_to_resume, folder.path, lambda: folder.n_readings, "reading", arguments, "--resume")
     say(arguments, f"seed {arguments.seed}")
     with contextlib.ExitStack() as stack:
         stack.enter_context(reporting_what_is_kept(kept_message))
@@ -89,7 +86,7 @@ def run(arguments: argparse.Namespace) -> int:
     files_rng = np.random.default_rng(files_seed)
     made = output_of(found, seed=arguments.seed, rng=files_rng, source=arguments.arm, concealed=concealed)
     with reporting_what_is_kept(kept_message, results=True), progress_of(arguments) as progress:
-        drawings.write_results(made, inputs=inputs_and_filled_in_plan(read, out / NEXT_PLAN), progress=progress)
+        drawings.write_results(made, inputs=tables_and_descriptions(read), progress=progress)
     known = [] if concealed is None else [f"concealed    {', '.join(concealed) or 'nothing'}"]
     return finish(arguments, drawings, found.summary(), *known, f"written to {out}")
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from pathlib import Path
 
 from probewise._words import count_with_noun, unit_after_number
 from probewise._writing import Output, StagedFiles
@@ -155,6 +154,5 @@ def output_of(value: PlanAudit, *, seed: int | None = None, source: str = "the p
         if value.cure_plan is not None:
             write_plan(value.cure_plan, stage / CURE_PLAN)
 
-    outdated = (CURE_PLAN, Path(CURE_PLAN).with_suffix(".json").name)
     page = partial(page_html, value, source=source)
-    return Output(write_files, figure_drawers(value), page, outdated, main="audit.json")
+    return Output(write_files, figure_drawers(value), page, main="audit.json")

@@ -434,7 +434,6 @@ def output_of(
         partial(_write_files_of_simulator if of_simulator else partial(_write_files_of_light_sensor, rng=rng), value),
         figure_drawers(value),
         partial(page_html, value, source=source, seed=seed),
-        ("witness_*.svg", "gain.svg", *(("next.csv",) if of_simulator else (NEXT_PLAN, "next_plan.json"))),
         main="diagnosis.json",
     )
 

@@ -340,4 +340,4 @@ def output_of(value: Exploration, *, seed: int | None = None) -> Output:
         return page_html(value, last, drawn["run.gif"], seed=seed, model=model, truth=known, unit=unit)
 
     animation = {"run.gif": lambda: animated_gif([draw() for draw in frames.values()])}
-    return Output(write_files, frames | animation, page, ("frames/[0-9][0-9][0-9].png",), main="result.json")
+    return Output(write_files, frames | animation, page, main="result.json")

@@ -121,7 +121,7 @@ def test_every_rival_reaches_another_process():
 
 def test_a_rival_is_of_a_size_and_at_a_time_that_a_run_can_show():
     found = {rival.name: rival.effect.prior.marginals for rival in rivals() if rival.effect is not None}
-    width, at_s = found["backlash"]["width_mm"], found["ambient_step"]["at_s"]
+    width, at_s = found["backlash"]["x_mm"], found["ambient_step"]["at_s"]
     assert width.to_unit(np.array([0.5]))[0] < 0.3
     run_of_twelve = at_s.to_unit(np.array([4.0, 12 * 8.0]))
     assert run_of_twelve[0] == 0.0
@@ -199,6 +199,9 @@ def test_what_leads_is_said_with_its_numbers(stepped):
     said = left_out_after_step(leading(stepped[-1], "backlash"), 0.9)
     assert said.leading == "backlash"
     assert said.credible_set == ("backlash",)
+    two = left_out_after_step(leading(stepped[-1], "dark_level+gain"), 0.9)
+    assert two.as_json()["hypotheses"][0]["effects"] == ["dark_level", "gain"]
+    assert "other light; and since the calibration the signal" in two.sentence
     assert "gear play of" in said.sentence
 
 
@@ -544,9 +547,9 @@ def test_gear_play_may_spare_the_first_reading(doubting):
     kinds = [kind for kind in doubting.kinds if kind.left_out == "backlash"]
     places = [Reading(10.0, Pose(x, y), 8.0 * k) for k, (x, y) in enumerate(PLAYED)]
     plan = doubting.problem(places).recording.plan
-    theta = np.array([[922.0, 240.0, 77.0, 6.0]])
+    theta = np.array([[922.0, 240.0, 77.0, 6.0, 4.0]])
     plain = doubting.kinds[0].model.predict(theta[:, :3], plan)[0, 0]
-    every = [kind.model.predict(theta, plan)[0] for kind in kinds]
+    every = [kind.model.predict(theta[:, : len(kind.prior.names)], plan)[0] for kind in kinds]
     for moved, rested in (every[:2], every[2:]):
         np.testing.assert_allclose(moved[1:], rested[1:])
         assert rested[0] == pytest.approx(plain)
@@ -560,12 +563,12 @@ def test_play_of_each_axis_stays_on_the_side_that_the_axis_last_moved_to(doubtin
     sides = [(1, 1), (1, 1), (1, 1), (-1, 1), (-1, 1)]
     taken = [Reading(10.0, Pose(x, y), 8.0 * k) for k, (x, y) in enumerate(places)]
     short = [
-        Reading(10.0, Pose(x - 3.0 * a, y - 3.0 * b), 8.0 * k)
+        Reading(10.0, Pose(x - 3.0 * a, y - 2.0 * b), 8.0 * k)
         for k, ((x, y), (a, b)) in enumerate(zip(places, sides, strict=True))
     ]
     circle = np.array([[922.0, 240.0, 77.0]])
     right = doubting.kinds[0].model.predict(circle, doubting.problem(short).recording.plan)
-    found = kind.model.predict(np.append(circle, [[6.0]], axis=1), doubting.problem(taken).recording.plan)
+    found = kind.model.predict(np.append(circle, [[6.0, 4.0]], axis=1), doubting.problem(taken).recording.plan)
     np.testing.assert_allclose(found, right, atol=1e-6)
 
 
@@ -584,19 +587,26 @@ def test_play_of_each_axis_is_so_after_the_file_of_the_repaired_sensor_too(doubt
     plan = Plan.from_arrays(x_mm=[0.0, 3.0], y_mm=[0.0, 4.0], patterns=Uniform(0.5), unit="LEGO")
     theta = read.samples_for_new_scans[:1]
     there = read.chain(scene.KnownScene(plan.patterns)).poses(theta, plan)
-    short = theta[0, -1] / 2
-    assert short > 0
-    np.testing.assert_allclose([there.x_mm[0], there.y_mm[0]], [[-short, 3.0 - short], [-short, 4.0 - short]])
+    short = theta[0, -2:, None] / 2
+    assert (short > 0).all()
+    np.testing.assert_allclose([there.x_mm[0], there.y_mm[0]], np.array([[0.0, 3.0], [0.0, 4.0]]) - short)
     assert json.loads((tmp_path / "sensor.json").read_text())["effects"] == ["backlash"]
 
 
-def test_what_changed_since_the_calibration_is_in_the_levels_of_the_repaired_sensor(sensor, stepped):
-    for name, dark, bright in (("dark_level", 4.0, 4.0), ("gain", 0.0, -4.7)):
+def test_what_changed_since_the_calibration_is_in_the_levels_of_the_repaired_sensor(doubting, sensor, stepped):
+    """Two routes: the rival's readings over black and white, and the levels of the sensor that it leaves."""
+    plan = doubting.problem([Reading(10.0, Pose(x, 250.0), x) for x in (50.0, 500.0)]).recording.plan
+    circle = [500.0, 250.0, 100.0]
+    plain = doubting.kinds[0].model.predict(np.array([circle]), plan)
+    changes = {"dark_level": [4.0], "gain": [-0.1], "dark_level+gain": [4.0, -0.1]}
+    for name, dark, bright in (("dark_level", 4.0, 4.0), ("gain", 0.0, -4.7), ("dark_level+gain", 4.0, -0.7)):
         info = leading(stepped[-1], name)
         which = [kind.left_out for kind in info.by_kind.kinds].index(name)
         found = info.by_kind.particles[which].weighted
         theta = found.theta.copy()
-        theta[:, -1] = 4.0 if name == "dark_level" else -0.1
+        theta[:, 3:] = changes[name]
+        changed = doubting.kinds[which].model.predict(np.array([[*circle, *changes[name]]]), plan)
+        np.testing.assert_allclose(changed - plain, [[dark, bright]], atol=0.31)  # of a sensor with a span of 50
         particles = [
             replace(p, weighted=replace(found, theta=theta)) if k == which else p
             for k, p in enumerate(info.by_kind.particles)
@@ -626,7 +636,7 @@ def test_levels_that_a_sensor_holds_as_changed_are_no_rivals_of_it(sensor, colum
     held = replace(sensor, names=(*sensor.names, column), samples=samples, effects=(name,))
     field = scene.Field()
     kinds = experiment_for(held, scene.Circle(field), field, trust=0.9).kinds
-    assert name not in {kind.left_out for kind in kinds}
+    assert {kind.left_out for kind in kinds}.isdisjoint({name, "dark_level+gain"})
 
 
 def test_the_next_run_starts_with_the_doubt_that_the_last_one_left(sensor):

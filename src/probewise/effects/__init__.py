@@ -101,9 +101,12 @@ def name_without_copy_suffix(name: str) -> str:
 
 
 def spoken_name(name: str) -> str:
-    """Return an effect's name without a copy's suffix; spaces for underscores, unless with a target ("drifts:a_1")."""
+    """Return an effect's name, or those of two at once, without a copy's suffix, as said.
+
+    Spaces stand for underscores, unless the name has a target ("drifts:a_1").
+    """
     own = name_without_copy_suffix(name)
-    return own if ":" in own else own.replace("_", " ")
+    return own if ":" in own else own.replace("_", " ").replace("+", " and ")
 
 
 def name_of_first_copy(name: str) -> str | None:

@@ -17,11 +17,11 @@ from probewise._words import count_with_noun
 from probewise.arm.carry_out import recording_of
 from probewise.arm.instrument import Pose, Reading
 from probewise.calibration import FittedSensor
-from probewise.effects import SINCE_CALIBRATION, spoken_name
+from probewise.effects import spoken_name
 from probewise.experiment.arm_error import ArmError
 from probewise.experiment.judgement import Judgement, is_target_reached, largest_sd_mm, probability_of_length_off
 from probewise.experiment.kinds import HypothesisKind, PosteriorByKind
-from probewise.experiment.rivals import Pace
+from probewise.experiment.rivals import LEVELS_CHANGED, Pace
 from probewise.experiment.setup import Experiment
 from probewise.experiment.simulated import HiddenShape
 from probewise.inquiry import UtilityMap
@@ -189,12 +189,8 @@ class Exploration(Reported):
 
     @property
     def stop_reason(self) -> str:
-        """Reason why the run ended, and the largest sd with the arm's error if the stopping rule did not count that."""
-        reason = stop_reason_with_checks(self.steps) or "the caller ended it"
-        if self.arm_error is None or self.experiment.fitted_arm is not None:
-            return reason
-        widest = largest_sd_mm(self.last.names, self.sd)
-        return f"{reason}; with the arm's own error the widest is known to {widest:.1f} mm"
+        """Reason why the run ended."""
+        return stop_reason_with_checks(self.steps) or "the caller ended it"
 
     @property
     def target_reached(self) -> bool:
@@ -386,7 +382,8 @@ class LeftOutEffects:
     def as_json(self) -> dict[str, Any]:
         """Return the entry "left_out" of result.json."""
         hypotheses = [
-            {"effects": [] if name == CLEAN else [name], "probability": p} for name, p in self.probability.items()
+            {"effects": [] if name == CLEAN else name.split("+"), "probability": p}
+            for name, p in self.probability.items()
         ]
         return {"hypotheses": hypotheses, "credible_set": list(self.credible_set), "sentence": self.sentence}
 
@@ -452,12 +449,12 @@ def repaired_sensor(sensor: FittedSensor, last: Step, *, rng: np.random.Generato
     note = f"a run that explored with it found {spoken_name(name)} (probability {p:.3g})"
     if name in sensor.absent and effect is not None and name not in _OF_THE_RUN:
         sensor = sensor.with_leading_effects()  # the run's own model, which did not hold it
-    if name in {form.name for form in SINCE_CALIBRATION}:  # the levels themselves have changed
-        change, own = samples.samples(len(sensor.samples), rng=rng)[:, -1], sensor.samples.copy()
-        if name == "dark_level":
-            own[:, [dark, bright]] += change[:, None]
-        else:
-            own[:, bright] += change * (own[:, bright] - own[:, dark])
+    if effect is not None and name in {form.name for form in LEVELS_CHANGED}:
+        drawn, names = samples.samples(len(sensor.samples), rng=rng), effect.prior.names
+        change = dict(zip(names, drawn[:, -len(names) :].T, strict=True))
+        own = sensor.samples.copy()
+        own[:, bright] += change.get("frac", 0.0) * (own[:, bright] - own[:, dark])
+        own[:, [dark, bright]] += np.reshape(change.get("offset", 0.0), (-1, 1))
         return replace(sensor, samples=own, notes=(*sensor.notes, f"{note}, which its levels now include"))
     if effect is None or name in _OF_THE_RUN or name in sensor.effects:
         return replace(sensor, notes=(*sensor.notes, f"{note}, which the model does not hold"))

@@ -111,17 +111,16 @@ def rivals_of(
         )
     dark, bright = model.levels.i_min, model.levels.i_max
     carried = {effect.name for effect in model.effects}
-    rivals = []
-    for name, wide in ({**ON_FIELD, **WITH_CARDS} if cards_of(model) else ON_FIELD).items():
+    rivals, with_cards = list[SensorModelRival](), bool(cards_of(model))
+    candidates = [(VOCABULARY[name], wide) for name, wide in (ON_FIELD | (WITH_CARDS if with_cards else {})).items()]
+    candidates += [(kind, False) for kind in (LEVELS_CHANGED if with_cards else ONLY_IN_RUNS)]
+    for kind, wide in candidates:
         plan = _plan_there_and_back(math.hypot(*field_mm) if wide else _SCAN_MM, height_mm)
         extent = Extent(min(dark, bright), max(dark, bright), plan)
-        effect = VOCABULARY[name].for_extent(extent)
-        if effect is not None and name not in carried:
-            rivals += [SensorModelRival(name, effect=way) for way in _forms_of_effect_in_run(effect, extent, field_mm)]
-    extent = Extent(min(dark, bright), max(dark, bright), _plan_there_and_back(_SCAN_MM, height_mm))
-    forms = [form for form in (SINCE_CALIBRATION if cards_of(model) else ONLY_IN_RUNS) if form.name not in carried]
-    in_any_run = [effect for form in forms if (effect := form.for_extent(extent)) is not None]
-    rivals += [SensorModelRival(form.name, effect=EffectWithRunPrior(form, field_mm)) for form in in_any_run]
+        effect = kind.for_extent(extent)
+        if effect is not None and carried.isdisjoint(kind.name.split("+")):
+            ways = _forms_of_effect_in_run(effect, extent, field_mm)
+            rivals += [SensorModelRival(kind.name, effect=way) for way in ways]
     noise = DeclaredNoise.from_likelihood(likelihood)
     if noise is not None:
         rivals += [
@@ -205,7 +204,25 @@ def _scale_of_axis(kind: LightEffect, of: Extent, axis: str, other: str) -> Effe
     return kind.linear(of, {axis: "1"}, 0.01, act, says)
 
 
-ONLY_IN_RUNS = (*SINCE_CALIBRATION, scale_of_x, scale_of_y)
+@light_effect("dark_level+gain", Stage.GAIN, "other levels than at the calibration", ("level",))
+def dark_level_and_gain(kind: LightEffect, of: Extent) -> Effect:
+    """Return both changes since the calibration at once, as on another day: signal x (1 + frac) + offset."""
+    dark, gain = (cast(Effect, form.for_extent(of)) for form in SINCE_CALIBRATION)
+
+    def act(value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
+        return np.asarray(dark.apply(gain.apply(value, theta[:, 1:], plan), theta[:, :1], plan))
+
+    def says(mean: FloatArray, sd: FloatArray) -> str:
+        return f"{dark.sentence(mean[:1], sd[:1])}; and {gain.sentence(mean[1:], sd[1:])}"
+
+    priors = {**dark.marginals, **gain.marginals}
+    return kind.bind(of, {name: (prior, "") for name, prior in priors.items()}, act, np.zeros((0, 1, 2)), says)
+
+
+LEVELS_CHANGED = (*SINCE_CALIBRATION, dark_level_and_gain)
+"""Changes of the levels since the calibration, one or both."""
+
+ONLY_IN_RUNS = (*LEVELS_CHANGED, scale_of_x, scale_of_y)
 """Effects that only a run without cards has as rivals, besides those in `ON_FIELD`."""
 
 

@@ -162,7 +162,7 @@ CONCEALED_BY_FORM: Mapping[str, Mapping[str, Row]] = {
         ),
         "gain_and_dark_level": (
             lambda a, now, rng: (conceal.gain_drift(a / 50, math.inf), conceal.ambient_step(a, -math.inf)),
-            *(_and_tenfold(2.0), "gain dark_level"),
+            *(_and_tenfold(2.0), "dark_level+gain gain dark_level"),
         ),
     },
 }

@@ -63,6 +63,7 @@ def test_what_is_known_of_a_reading_takes_the_place_of_what_was_asked_for_and_th
 BAD = {
     "nothing": (None, "what measure returned is None; allowed: a finite number, or a dict"),
     "a text": ("41", "what measure returned is '41'; allowed: a finite number"),
+    "a masked number": (np.ma.masked, "what measure returned is masked; allowed: a finite number"),
     "a truth": (True, "what measure returned is True; allowed: a finite number"),
     "no value": ({"reading": 3}, r"what measure returned is \{'reading': 3\}; allowed: a dict with \"value\""),
     "a text beside it": ({"value": 3, "note": "ok"}, "note of what measure returned is 'ok'; allowed: a finite number"),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -89,6 +91,27 @@ def test_where_all_times_are_equal_rows_count():
     np.testing.assert_array_equal(about.covariate_values_by_name(_Y)["row"], np.arange(_N))
 
 
+_SAME = "column same left out: it is the reading in another unit, and cannot be what the reading depends on"
+
+
+@pytest.mark.parametrize(
+    ("same", "options", "is_same"),
+    [
+        (1000 * _Y, {}, True),
+        (np.round(32 + 1.8 * _Y, 2), {}, True),
+        (_Y + 0.01 * np.cos(50 * _X), {}, False),  # of another sensor
+        (np.round(_Y), {}, False),  # too coarse to tell
+        (1000 * _Y, {"controls": ["same"]}, False),
+        (1000 * _Y, {"simulate": lambda p, u: p["a"] + p["b"] * u["same"]}, False),
+    ],
+)
+def test_a_column_that_is_the_reading_in_another_unit_explains_nothing(same, options, is_same):
+    simulator = replace(_line(), **options)
+    prepared = prepare_system(simulator, table_for(simulator, {"x": _X, "same": same, "y": _Y}))
+    assert (_SAME in prepared.recording.notes) == is_same
+    assert ("curve:same" in prepared.effects) != is_same
+
+
 def test_a_table_of_readings_alone_is_refused():
     constant = Simulator("y", "V", {"a": (-5, 5)}, simulate=lambda p, u: p["a"])
     with pytest.raises(ParameterError, match=r"columns is \['y'\]; allowed: a column besides the reading"):
@@ -120,6 +143,7 @@ def test_a_missing_reading_is_no_reason_why_a_law_predicts_nothing_later_in_the_
         (diagnose_system, 40, np.nan, "usable readings is 0; allowed: 12 or more"),
         (fit_simulator, 1, np.nan, "usable readings is 0; allowed: 3 or more"),
         (fit_simulator, 40, np.nan, "usable readings is 0; allowed: 3 or more"),
+        (fit_simulator, 40, np.inf, "reading 'y' in row 2 is 'inf'; allowed: a number in each row"),
     ],
 )
 def test_a_table_of_one_row_or_without_a_reading_is_refused_before_any_fit(task, n, reading, said):

@@ -40,6 +40,14 @@ def test_effects_are_those_that_could_show_here():
     assert not prepared.is_thinned
 
 
+def test_a_covariate_that_is_the_reading_in_another_unit_is_left_out_but_not_what_was_commanded():
+    bare = recording()
+    columns = {name: 5 * bare.readings + 100 for name in ("adc", "led")}
+    prepared = prepare(replace(bare, plan=replace(bare.plan, covariates=columns)), apparatus=SENSOR)
+    assert list(prepared.recording.plan.covariates) == ["led"]
+    assert "column adc left out: it is the reading in another unit" in prepared.recording.notes[-1]
+
+
 @pytest.mark.parametrize("lost", [{}, {31: 999.0}, {0: -1000.0, 50: 1e9}])
 @pytest.mark.parametrize("step", [1, 7])
 def test_readings_too_far_out_for_noise_are_left_out_and_scale_nothing(lost, step):

@@ -245,16 +245,21 @@ def test_a_journal_that_names_the_geometry_is_not_resumed_with_another_and_an_ol
 
 
 def test_a_reading_that_the_sensor_cannot_return_is_not_written(small, tmp_path):
-    """Else a run could never go on: its journal would hold what it refuses."""
+    """Else a run could never go on: its journal would hold what it refuses, as one does that was changed."""
 
     class Broken:
         def measure(self, pose):
-            return 1023.0
+            return value
 
-    experiment = small.experiment(reading_range=(0.0, 100.0))
+    experiment, value = small.experiment(reading_range=(0.0, 100.0)), 1023.0
     with pytest.raises(LinkError, match=r"beyond the sensor: reading is 1023\.0; allowed: 0 to 100"):
         run(Broken(), experiment, rng=np.random.default_rng(5), journal=tmp_path / "j")
     assert read_journal(tmp_path / "j").entries == ()
+    value = 10.0
+    run(Broken(), experiment, rng=np.random.default_rng(5), journal=tmp_path / "j", max_readings=1)
+    (tmp_path / "j").write_text((tmp_path / "j").read_text().replace('"reading": 10.0', '"reading": 1023.0'))
+    with pytest.raises(FileError, match=r"j, line 2: reading is 1023\.0; allowed: 0 to 100"):
+        run(Broken(), experiment, rng=np.random.default_rng(5), journal=tmp_path / "j")
 
 
 IMPOSSIBLE = {

@@ -4,6 +4,7 @@ import itertools
 import subprocess
 import sys
 
+import matplotlib as mpl
 import numpy as np
 import pytest
 
@@ -84,6 +85,17 @@ def test_a_legend_beside_long_names_below_it_is_whole_and_ticks_stand_apart():
 def test_the_same_drawing_gives_the_same_bytes():
     first, second = (plots.svg(plots.heldout_gain_by_scan([("edge_0", 0.5)], 0.2, 0.05)) for _ in range(2))
     assert first == second
+
+
+def test_a_name_is_drawn_as_it_is_written_whatever_style_is_set():
+    """Neither as a formula, nor by LaTeX, which may not be there; powers along a logarithmic axis are formulas."""
+    with mpl.rc_context({"text.usetex": True}):
+        ax = canvas.axes_or_new(None)
+        ax.plot([1, 1000])
+        ax.set(yscale="log", xlabel=r"$\frac{1}$ of $5 in a_b, %")
+        drawn = canvas.svg(ax).decode()
+    assert r"$\frac{1}$ of $5 in a_b, %" in drawn
+    assert r"$\mathdefault{10^{2}}$" in drawn
 
 
 def test_rounded_readings_lie_on_their_lattice(figures):

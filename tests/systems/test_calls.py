@@ -1,11 +1,11 @@
 """How a person's function is called: whatever it takes, the same readings."""
 
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
 
 import numpy as np
 import pytest
 
-from probewise.errors import FileError, ParameterError, ShapeError
+from probewise.errors import FileError, NotConvergedError, ParameterError, ShapeError
 from probewise.priors import Uniform
 from probewise.systems import Law, RunTable, Simulator, System, read_simulator
 from probewise.systems.calls import Caller, SpreadCalls
@@ -58,7 +58,19 @@ def test_calls_that_are_spread_over_processes_give_the_same_readings_in_as_many_
         parameters = {"a": np.array([[1.3], [1.5], [1.8]]), "b": np.outer([1.0, 1.1, 1.2], 1 + 0.1 * X)}
         both = [caller(parameters, {"x": X}) for caller in (here, there)]
     np.testing.assert_array_equal(*both)
+
     assert (here.n_calls, here.n_failed) == (there.n_calls, there.n_failed) == (11, 1)
+
+
+def test_a_process_that_dies_is_said_in_words_and_is_no_error_of_the_function(tmp_path):
+    """As one that the system ends for want of memory."""
+
+    class Dead(ThreadPoolExecutor):
+        def map(self, *_, **__):
+            raise BrokenExecutor
+
+    with pytest.raises(NotConvergedError, match="a worker process that called simulate has died"):
+        _system(SpreadCalls(_with_a_loop, tmp_path / "own.py", Dead(1), 2))
 
 
 @pytest.mark.parametrize(

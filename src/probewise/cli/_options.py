@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import math
+import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -52,6 +53,10 @@ SIZES = ("small", "plain", "gross")  # of a concealed effect
 
 class OneLineParser(argparse.ArgumentParser):
     """An argument parser that reports errors in one line, with a suggestion for misspelt options."""
+
+    def __init__(self, *args: Any, **named: Any) -> None:
+        super().__init__(*args, **named)
+        self._negative_number_matcher = re.compile(r"-\.?\d")  # no option, but a value: -20,0 and -1e3 as well as -20
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: {printable(shortened(message))} (see {self.prog} --help)\n")

@@ -8,6 +8,7 @@ the readings as well; there it is the step that likely parameters need.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, cast
@@ -27,7 +28,8 @@ from probewise.diagnosis.prepared import MOST_DIAGNOSED_READINGS, Prepared, posi
 from probewise.diagnosis.search import search
 from probewise.diagnosis.simulator_rows import CALLS_OF_A_SEARCH, SimulatorApparatus
 from probewise.effects import Effect, NoiseEffect
-from probewise.errors import ParameterError
+from probewise.effects.noise import SAYS_THE_SAME, says_what_readings_say
+from probewise.errors import ParameterError, ProbewiseError
 from probewise.priors import LogUniform, Normal, Uniform
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Plan, Recording, masks_of_readings_at_ends
@@ -314,6 +316,18 @@ def recording_from_table(simulator: Simulator, table: RunTable) -> RunRecording:
     return _without_readings(whole, ~np.isin(np.arange(len(table)), chosen), note)
 
 
+def _without_copies_of_reading(simulator: Simulator, table: RunTable) -> RunTable:
+    """Leave out, with a note, columns that are the reading in another unit, unless the simulator reads them."""
+    readings, inputs = table.covariates.get(simulator.reading), simulator.inputs(table.covariates)
+    for name in sorted(inputs.keys() - {*simulator.controls}) if readings is not None else ():
+        if says_what_readings_say(inputs[name], readings):
+            less = replace(table, columns={k: v for k, v in table.columns.items() if k != name})
+            with contextlib.suppress(ProbewiseError):
+                System.of(simulator, less)
+                table = replace(less, notes=(*less.notes, f"column {name} left out: {SAYS_THE_SAME}"))
+    return table
+
+
 def without_unpredictable_readings(system: System, recording: RunRecording, *, every_row: bool = False) -> RunRecording:
     """Leave out, with a note, the readings of rows in which a missing column makes a prediction impossible.
 
@@ -495,6 +509,7 @@ def prepare_system(
 
     A law is integrated by a linearly implicit method if `stiff`, or where it needs one.
     """
+    table = _without_copies_of_reading(simulator, table) if with_effects else table
     said = (*table.notes, *notes, *note_on_row_order(simulator, table))
     recording = replace(recording_from_table(simulator, table), source=source or simulator.source, notes=said)
     system = System.of(simulator, table, stiff=stiff)

@@ -25,7 +25,7 @@ from probewise.diagnosis.sensors import (
     starts_of_one_gaussian,
 )
 from probewise.effects import Effect, Extent
-from probewise.effects.noise import LARGEST_SIZE
+from probewise.effects.noise import LARGEST_SIZE, SAYS_THE_SAME, says_what_readings_say
 from probewise.errors import ParameterError, require
 from probewise.recordings.patterns import Pattern, have_same_albedo
 from probewise.recordings.plan import Plan, Recording, require_patterns_described, require_recording
@@ -151,6 +151,18 @@ def _notes_on_differences(plans: Sequence[Plan], labels: Sequence[str]) -> Itera
                 yield f"{declares}, {labels[0]} {taken:g}: readings are taken to be at the height of each"
             else:
                 yield f"{declares}: taken is {'none, as' if taken is None else f'{taken:g}, that of'} {labels[0]}"
+
+
+def _without_copies_of_reading(recording: Recording) -> Recording:
+    """Leave out, with a note, covariates that are the reading in another unit, unless they were commanded."""
+    plan, usable = recording.plan, recording.usable
+    own = plan.covariates.keys() - {*COMMANDED, *plan.instrumentation.controls}
+    same = [k for k in own if says_what_readings_say(plan.covariates[k][usable], recording.readings[usable])]
+    if not same:
+        return recording
+    kept = {name: values for name, values in plan.covariates.items() if name not in same}
+    notes = [f"column {name} left out: {SAYS_THE_SAME}" for name in sorted(same)]
+    return replace(recording, plan=replace(plan, covariates=kept), notes=(*recording.notes, *notes))
 
 
 def _is_same_recording(one: Recording, other: Recording) -> bool:
@@ -298,7 +310,7 @@ def prepare(
         raise ParameterError("sensor, null", "both", "one of them: a null contains the prior of its sensor")
     if sensor is not None:
         require_sensor_prior(sensor)
-    everything = join([recordings] if isinstance(recordings, Recording) else recordings)
+    everything = _without_copies_of_reading(join([recordings] if isinstance(recordings, Recording) else recordings))
     if null is None:
         require_patterns_described(everything.plan)
     if sensor is not None:

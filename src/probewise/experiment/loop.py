@@ -278,7 +278,8 @@ def _yield_steps(
             number = len(state.readings) + 1
             entry = replayed[number - 1] if number <= len(replayed) else None
             reading = instrument.measure(state.next_pose) if entry is None else entry.reading
-            _require_possible_reading(experiment, reading)  # before it is written, or a resumed run fails again
+            journal = None if entry is None else before
+            _require_possible_reading(experiment, reading, journal, number)  # before it is written, or resuming fails
             if writer is not None and entry is None:
                 writer.write_reading(number, reading)
             height_mm = covariates_with_height(reading).get("height_mm")  # NaN: missing
@@ -339,12 +340,17 @@ def _doubt_about_height(experiment: Experiment, height_mm: float | None) -> str 
     )
 
 
-def _require_possible_reading(experiment: Experiment, reading: Reading) -> None:
-    """Raise LinkError for a value, LED or height out of range: the instrument is at fault; the run can be resumed."""
+def _require_possible_reading(experiment: Experiment, reading: Reading, journal: Journal | None, number: int) -> None:
+    """Raise LinkError for a value, LED or height out of range: the instrument is at fault, and the run can be resumed.
+
+    FileError for one that the `journal` holds: it was changed.
+    """
     try:
         experiment.readout.require_in_range(reading.value)
         require_possible_commands(experiment.problem([reading]).recording.plan)
     except ParameterError as error:
+        if journal is not None:
+            raise FileError(journal.path, f"{error.name} is {error.value}", error.allowed, row=number + 1) from error
         raise LinkError(f"what the instrument returned is beyond the sensor: {error}") from error
 
 

@@ -19,7 +19,7 @@ from probewise.report import audit, calibration, exploration, fit, investigation
 from probewise.report.covariates import ResidualNoise
 from probewise.report.diagnosis_figures import draw_first_figure
 from probewise.report.html import element, figure
-from probewise.report.plots.canvas import AxesGrid, png
+from probewise.report.plots.canvas import AxesGrid, figure_of, png, text_as_it_is
 from probewise.report.plots.nested import corner_plot
 from probewise.report.plots.readings import predicted_and_recorded_by_scan, readings_by_orientation
 from probewise.report.plots.residuals import readings_in_order, recorded_against_predicted
@@ -68,7 +68,9 @@ def drawing_of(value: object) -> Axes | AxesGrid:
     """Draw a result's main picture; return its axes. ParameterError if a result of this type has none."""
     if (kind := _kind_with_picture(value)) is None:
         raise ParameterError("result", value, f"one with a picture: {', '.join(k.__name__ for k in _DRAWINGS)}")
-    return _DRAWINGS[kind][0](value)
+    drawn = _DRAWINGS[kind][0](value)
+    with text_as_it_is(figure_of(drawn)):
+        return drawn
 
 
 def html_of(value: object) -> str:

@@ -8,7 +8,7 @@ import inspect
 import itertools
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor
+from concurrent.futures import BrokenExecutor, Executor
 from dataclasses import dataclass, field
 from functools import cache, partial
 from pathlib import Path
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probewise._arrays import MOST_NUMBERS, FloatArray, IntArray, floats, nearly_equal
-from probewise.errors import FileError, ParameterError, ShapeError, message_of, require, shown
+from probewise.errors import FileError, NotConvergedError, ParameterError, ShapeError, message_of, require, shown
 from probewise.progress import Progress
 from probewise.recordings.cells import first_cell_without_number
 from probewise.recordings.io import EndedByFile, in_this_directory
@@ -288,9 +288,16 @@ class SpreadCalls:
         return self.__wrapped__(parameters, columns)
 
     def many(self, given: Sequence[tuple[Values, Values]]) -> Iterator[FloatArray | None]:
-        """Yield what it returns for each parameters and columns, in this order; None where it raises an error."""
+        """Yield what it returns for each parameters and columns, in this order; None where it raises an error.
+
+        NotConvergedError if a process ends, for a call that ended it could end this one too.
+        """
         each, chunk = partial(_readings_or_none, self._path), max(len(given) // self._n_chunks, 1)
-        return self._executor.map(each, given, chunksize=chunk)
+        try:
+            yield from self._executor.map(each, given, chunksize=chunk)
+        except BrokenExecutor as error:
+            why = f"a worker process that called simulate has died, by a signal or for want of memory ({error})"
+            raise NotConvergedError(f"{why}; without --workers the calls are made one by one") from error
 
 
 _simulate_of_file: Callable[[Path], Any] = cache(lambda path: read_simulator(path).simulate)

@@ -84,12 +84,13 @@ class SystemPrediction(ShowsItself):
 def as_recording(simulator: Simulator, table: RunTable) -> RunRecording:
     """Build a recording from a table, with the simulator's unit, range and step; readings are NaN without a column.
 
-    Raises ParameterError if the readings are texts, or a declared sd is not positive where there is a reading.
+    Raises ParameterError if the readings are texts, one is infinite, or a declared sd is not positive where there is a
+    reading.
     """
     (low, high), step, sd = simulator.noise.range, simulator.noise.step, simulator.noise.sd
     instrument = Instrumentation(unit=simulator.unit, min=low, max=high, step=step, controls=simulator.controls)
     readings = table.columns.get(simulator.reading, np.full(len(table), np.nan))
-    if readings.dtype != np.float64:
+    if readings.dtype != np.float64 or np.isinf(readings).any():
         allowed = "a number in each row, or nothing where it is missing"
         raise column_error(f"reading {simulator.reading!r}", readings, allowed, first=table.first_line)
     own, sd_column = replace(table, instrumentation=instrument), sd if isinstance(sd, str) else ""

@@ -6,10 +6,11 @@ Without axes, a plot function opens a pyplot figure, so that `plt.savefig` and `
 
 from __future__ import annotations
 
+import contextlib
 import io
 import re
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from typing import Any, Literal, TypeAlias, cast
 from weakref import WeakSet
@@ -26,6 +27,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.layout_engine import LayoutEngine
 from matplotlib.patches import Rectangle
+from matplotlib.text import Text
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from PIL import Image, ImageChops, ImageOps
@@ -115,6 +117,17 @@ def figure_of(drawing: Axes | AxesGrid | Figure) -> Figure:
     return first if isinstance(first, Figure) else cast(Figure, first.figure)
 
 
+@contextlib.contextmanager
+def text_as_it_is(sheet: Figure) -> Iterator[None]:
+    """Take no name for a formula, since a `$` may stand in one, and send no text to LaTeX, whatever style is set."""
+    for text in sheet.findobj(Text):
+        text.set_usetex(False)
+        if "\\mathdefault" not in text.get_text():  # of numbers along a logarithmic axis
+            text.set_parse_math("$" not in text.get_text())
+    with mpl.rc_context({"text.usetex": False}):  # also of ticks that are made while it is drawn
+        yield
+
+
 def png(drawing: Axes | AxesGrid | Figure, *, dpi: int = 110, tight: bool = True) -> bytes:
     """Render a drawing's figure as PNG; a figure that a plot function opened is closed, others stay open.
 
@@ -125,7 +138,8 @@ def png(drawing: Axes | AxesGrid | Figure, *, dpi: int = 110, tight: bool = True
     agg: Any = FigureCanvasAgg(sheet)  # `savefig` would draw everything twice, and measure it a third time
     sheet.dpi = dpi
     try:
-        agg.draw()
+        with text_as_it_is(sheet):
+            agg.draw()
     finally:
         sheet.set_canvas(own)
         sheet.dpi = own_dpi
@@ -143,7 +157,7 @@ def svg(drawing: Axes | AxesGrid) -> bytes:
     """Render a drawing's figure as SVG, reproducible byte for byte; a figure that a plot function opened is closed."""
     sheet, buffer = figure_of(drawing), io.BytesIO()
     own, canvas = sheet.canvas, cast(Any, FigureCanvasSVG(sheet))
-    with mpl.rc_context({"svg.hashsalt": "probewise"}):
+    with text_as_it_is(sheet), mpl.rc_context({"svg.hashsalt": "probewise"}):
         canvas.print_svg(buffer, metadata={"Date": None})  # `savefig` would draw everything twice
     sheet.set_canvas(own)
     if sheet in _OPENED:
@@ -167,7 +181,8 @@ def legend_above(ax: Axes, *, title: str = "") -> None:
 def fit_to_room(ax: Axes) -> None:
     """Lay the figure out, and fit legend and ticks of some axes to the width that long labels of others leave them."""
     sheet = figure_of(ax)
-    cast(LayoutEngine, sheet.get_layout_engine()).execute(sheet)
+    with text_as_it_is(sheet):
+        cast(LayoutEngine, sheet.get_layout_engine()).execute(sheet)
     legend_above(ax)
     if isinstance(ax.xaxis.get_major_locator(), MaxNLocator):
         width_in = ax.get_position().width * sheet.get_figwidth()

@@ -18,7 +18,7 @@ from matplotlib.patches import Rectangle
 
 from probewise._arrays import FloatArray
 from probewise.recordings.patterns import Disc, HalfPlane, Pattern, Polygon, Quadrant, Stripes, Uniform
-from probewise.report.plots.canvas import BLACK, VERMILLION, draw_map
+from probewise.report.plots.canvas import BLACK, VERMILLION, draw_map, text_as_it_is
 from probewise.report.sheets import (
     BOTTOM_MM,
     LEFT_MM,
@@ -67,12 +67,17 @@ def sheets_pdf(sheets: Sequence[Sheet], *, paper: str, title: str) -> bytes:
     buffer = io.BytesIO()
     about = {"Title": title, "Creator": "probewise", "Producer": None, "CreationDate": None}
     with mpl.rc_context({"path.simplify": False}), PdfPages(buffer, metadata=about) as pdf:
+
+        def add(page: Figure) -> None:
+            with text_as_it_is(page):
+                pdf.savefig(page)
+
         for k in range(n_covers):
             batch = listed[k * _SHEETS_PER_COVER : (k + 1) * _SHEETS_PER_COVER]
-            pdf.savefig(_draw_cover_page(batch, paper, title, f"page {k + 1} of {n_pages}"))
+            add(_draw_cover_page(batch, paper, title, f"page {k + 1} of {n_pages}"))
         for (sheet, tiles), first in listed:
             for k, tile in enumerate(tiles):
-                pdf.savefig(_draw_page(sheet, tiles, tile, first, f"page {first + k} of {n_pages}"))
+                add(_draw_page(sheet, tiles, tile, first, f"page {first + k} of {n_pages}"))
     return buffer.getvalue()
 
 

@@ -39,7 +39,7 @@ inquiry = Inquiry(peak, prior, frequencies_ghz, 0.1, goal={"centre_ghz": 0.005},
 hidden = {"centre_ghz": 3.37, "width_ghz": 0.06, "height": 1.2, "background": 0.2}
 views = []
 while not inquiry.settled:
-    if len(inquiry.readings) in (4, 9):
+    if len(inquiry.readings) in (2, 4):
         views.append((inquiry.readings, inquiry.posterior, inquiry.utility, inquiry.utility_label, inquiry.next()))
     inquiry.tell(peak(hidden, inquiry.next()) + 0.1 * rng.standard_normal())
 views.append((inquiry.readings, inquiry.posterior, inquiry.utility, inquiry.utility_label, None))
@@ -52,13 +52,14 @@ for (readings, posterior, worth, label, chosen), (above, below) in zip(views, ax
     drawn = posterior.samples(50, rng=rng)
     curves = peak(dict(zip(posterior.names, drawn.T[:, :, None], strict=True)), frequencies_ghz)
     above.plot(frequencies_ghz, curves.T, color="tab:blue", alpha=0.15)
-    above.plot(frequencies_ghz, peak(hidden, frequencies_ghz), "k--", linewidth=1, label="hidden")
+    above.plot(frequencies_ghz, peak(hidden, frequencies_ghz), "k--", linewidth=1, label="true peak, hidden from the inquiry")
     above.plot(*zip(*readings, strict=True), "o", color="tab:orange", markeredgecolor="k", label="readings")
     above.set(title=f"after {len(readings)} readings", ylim=(-0.6, 2.6))
     below.plot(frequencies_ghz, worth, color="tab:brown")
     if chosen is not None:
         for ax in (above, below):
             ax.axvline(chosen, color="tab:brown", linestyle=":", label="next")
-    below.set(xlabel="frequency (GHz)", ylabel=label.replace(" (", "\n(").replace("fall of", "fall of\n"))
+    below.set_xlabel("frequency (GHz)")
+    below.set_title(label, fontsize="small")
 axes[0, 0].set_ylabel("signal (V)")
-axes[0, 0].legend(frameon=False, loc="upper left")
+fig.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)

@@ -43,13 +43,13 @@ class ShowsItself:
 
         Raises ParameterError if a result of this kind has no picture.
         """
-        return importlib.import_module("probewise.report.notebook").drawing_of(self)
+        return importlib.import_module("probewise.report.results").drawing_of(self)
 
     def _repr_html_(self) -> str:
         import numpy as np  # it is loaded by the time there is a result
 
         with np.errstate(divide="warn", over="warn", under="ignore", invalid="warn"):  # whatever np.seterr says
-            return str(importlib.import_module("probewise.report.notebook").html_of(self))
+            return str(importlib.import_module("probewise.report.results").html_of(self))
 
     def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
         printer.text(str(self))
@@ -62,7 +62,7 @@ class Reported(ShowsItself):
 
     def to_html(self, *, seed: int | None = None) -> str:
         """Return the command's report.html: one page with its figures inside; it states the `seed` if given."""
-        return str(importlib.import_module("probewise.report.saving").page_of(self, seed=seed))
+        return str(importlib.import_module("probewise.report.results").page_of(self, seed=seed))
 
     def save(self, folder: str | Path, *, seed: int | None = None) -> Path:
         """Write the files that the command writes with `--out`, figures and report.html too; return the folder.
@@ -80,4 +80,4 @@ class Reported(ShowsItself):
         NotDrawnError
             If a figure could not be drawn; everything else is complete.
         """
-        return Path(importlib.import_module("probewise.report.saving").save(self, folder, seed=seed))
+        return Path(importlib.import_module("probewise.report.results").save(self, folder, seed=seed))

@@ -7,6 +7,7 @@ import re
 from collections.abc import Mapping
 from types import MappingProxyType
 
+_LEAST_IN_DIGITS = 1e-3  # a smaller mean and sd share a power of ten
 _LEAST_WITH_POINT = 1e-7  # a smaller sd has no two digits among eight after the point
 
 UNITS: Mapping[str, str] = MappingProxyType(
@@ -38,7 +39,13 @@ def unit_after_number(unit: str) -> str:
 def value_with_sd(mean: float, sd: float, unit: str = "", *, factor: float = 1.0) -> str:
     """Return "mean ± sd unit", both numbers times `factor`, rounded to two significant digits of the sd."""
     mean, sd = factor * mean, factor * sd
-    if 0 < sd < _LEAST_WITH_POINT and math.isfinite(mean):
+    largest = max(abs(mean), sd)
+    if sd > 0 and largest < _LEAST_IN_DIGITS:
+        power = math.floor(math.log10(largest))
+        scale = 10.0**-power
+        digits = max(1 - math.floor(math.log10(scale * sd)), 0)
+        written = f"({scale * mean:z.{digits}f} ± {scale * sd:.{digits}f})e{power:03d}"
+    elif 0 < sd < _LEAST_WITH_POINT and math.isfinite(mean):
         digits = max(math.floor(math.log10(max(abs(mean), sd))) - math.floor(math.log10(sd)) + 2, 2)
         written = f"{mean:z.{digits}g} ± {sd:.2g}"
     elif math.isfinite(sd) and sd > 0:

@@ -72,8 +72,22 @@ def test_a_missing_input_leaves_out_its_readings_and_no_effect(law):
     whole = {**table, "heat": np.where(np.isnan(table["heat"]), 1.5, table["heat"])}
     with_gap, without = (prepare_system(simulator, table_for(simulator, each)) for each in (table, whole))
     assert set(with_gap.effects) == set(without.effects)
-    assert np.flatnonzero(~with_gap.recording.usable).tolist() == (list(range(13, 30)) if law else [12])
+    assert np.flatnonzero(~with_gap.recording.usable).tolist() == (list(range(12, 30)) if law else [12])
     assert np.isfinite(with_gap.apparatus.about.predicted).all()
+
+
+@pytest.mark.parametrize(("every", "n_left_out"), [(13, 4), (3, 0)])
+def test_gaps_of_a_column_that_only_effects_read_move_no_effect(every, n_left_out):
+    """A few readings are left out; of a column that is logged less often the values between are interpolated."""
+    logged = np.where(np.arange(_N) % every if every == 3 else np.arange(_N) % every == 0, np.nan, _X)
+    simulator = Simulator("y", "V", {"a": (-5, 5)}, simulate=lambda p, u: p["a"] + 0.0 * u["t"], time="t")
+    table = table_for(simulator, {"t": np.arange(_N), "side": logged, "y": 1.0 + 0.3 * _X + 0.01 * _Y})
+    prepared = prepare_system(simulator, table)
+    assert int((~prepared.recording.usable).sum()) == n_left_out
+    assert any("column 'side' is missing" in note for note in prepared.recording.notes)
+    plan, effect = prepared.recording.plan, prepared.effects["sensitivity:side"]
+    changed = effect.apply(np.zeros((1, _N)), np.array([[1.0]]), plan)
+    assert np.isfinite(changed).all()
 
 
 def test_a_simulator_that_copes_with_a_missing_input_has_effects_of_that_column():
@@ -83,6 +97,21 @@ def test_a_simulator_that_copes_with_a_missing_input_has_effects_of_that_column(
     prepared = prepare_system(simulator, table_for(simulator, {"x": x, "y": 1.0 + 2.0 * np.nan_to_num(x) + _Y - 1}))
     assert {"periodic_error:x", "input_gain:x", "sensitivity:x"} <= set(prepared.effects)
     assert np.isfinite(prepared.effects["periodic_error:x"].bank()).all()
+
+
+@pytest.mark.parametrize(("gap", "n_variants"), [(100.0, 2), (0.0, 1)])
+def test_a_drift_of_runs_that_follow_each_other_may_begin_again_in_each(gap, n_variants):
+    """Three days of a tank's level were once named a wave of one day, since no drift counted from each morning."""
+    run = np.repeat([1.0, 2.0], _N // 2)
+    time = np.tile(_T[: _N // 2], 2) + gap * (run - 1.0)
+    simulator = Simulator("y", "V", {"a": (-5, 5)}, simulate=lambda p, u: p["a"] + 0.0 * u["t"], time="t", run="run")
+    prepared = prepare_system(simulator, table_for(simulator, {"t": time, "run": run, "y": _Y}))
+    drift, plan = prepared.effects["offset_drift"], prepared.recording.plan
+    assert len(drift.variants()) == n_variants
+    last = drift.variants()[-1].entries[:, 0]
+    expected = last[:, :1] * (np.tile(_T[: _N // 2], 2) if n_variants == 2 else time)
+    np.testing.assert_allclose(drift.apply(np.zeros((1, _N)), last, plan), expected)
+    assert ("in each run" in drift.sentence(last[0], 0.1 * last[0])) == (n_variants == 2)
 
 
 def test_where_all_times_are_equal_rows_count():

@@ -1,6 +1,7 @@
 """The demo's page: every figure is there, and the diagnosis is that of the command."""
 
 import io
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,11 +14,11 @@ from probewise.arm import Pose, SimulatedArm
 from probewise.cli import main
 from probewise.cli.demo import diagnose_shipped_recording
 from probewise.errors import ParameterError
-from probewise.experiment import Experiment, run_from_place
+from probewise.experiment import Experiment, HiddenShape, run_from_place
 from probewise.inference import GaussianKnown
 from probewise.inquiry import Grid, ReadingEntropy
 from probewise.recordings import Disc, read_recording, shipped
-from probewise.report.demo import RobotSearch, doubt_section, doubt_sentence, draw_views
+from probewise.report.demo import doubt_section, doubt_sentence, draw_views, largest_error_mm
 from probewise.report.plots import PAGE_IN, png
 from probewise.scene import Circle, HypothesisScene
 from probewise.sensor import Chain, FixedLevels, FixedMixture
@@ -36,7 +37,8 @@ def searched(max_readings):
     model = Chain(mixture, FixedLevels(10.0, 60.0), HypothesisScene(circle))
     grid = Grid(n_x=66, n_y=33)
     experiment = Experiment(circle, model, GaussianKnown(0.7), 0.7, grid, ReadingEntropy(), n_live=60, n_particles=500)
-    return run_from_place(FIRST, arm, experiment, rng=np.random.default_rng(5), max_readings=max_readings)
+    run = run_from_place(FIRST, arm, experiment, rng=np.random.default_rng(5), max_readings=max_readings)
+    return replace(run, hidden=HiddenShape("circle", circle, (600.0, 260.0, 90.0)))
 
 
 @pytest.fixture(scope="module")
@@ -65,17 +67,14 @@ def test_the_demo_the_command_and_the_function_diagnose_by_the_same_randomness(m
 
 def test_the_robot_that_doubts_is_shown_beside_the_one_that_trusts(found):
     """Their pictures, how both ended, and what the second one reports of its sensor."""
-    angle = np.linspace(0, 2 * np.pi, 60)
-    outline = np.array([600.0, 260.0]) + 90.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    truth = {"x_mm": 600.0, "y_mm": 260.0, "radius_mm": 90.0}
-    searches = [RobotSearch(name, found, truth, outline, (10.0, 60.0)) for name in ("trusting", "doubting")]
+    searches = {name: found for name in ("trusting", "doubting")}
     drawn = {"doubt.png": png(draw_views(searches, 2)), "belief.png": b"<svg></svg>"}
     widest = 110 * (PAGE_IN + 0.3)  # wider ones are shrunk on a page
     assert Image.open(io.BytesIO(drawn["doubt.png"])).width <= widest
-    said = "".join(doubt_section(searches, drawn).elements)
+    said = "".join(doubt_section(searches, drawn, white=60.0).elements)
     for row in ("trusting", "doubting"):
         assert f">{row}<" in said
-    assert f"2 readings, off by {searches[0].largest_error_mm:.1f} mm" in doubt_sentence(searches)
+    assert f"2 readings, off by {largest_error_mm(found):.1f} mm" in doubt_sentence(searches)
     assert found.stop_reason in said
 
 
@@ -90,9 +89,7 @@ def test_the_page_shows_every_figure_that_is_drawn(found):
     recording = read_recording(shipped("paper"))
     sensor = hand_made_sensor()
     calibration = SimpleNamespace(sensor=sensor, orders=sensor.orders, fields={1: sensor.field})
-    outline = np.array([[510.0, 260.0], [600.0, 350.0], [690.0, 260.0]])
-    truth = {"x_mm": 600.0, "y_mm": 260.0, "radius_mm": 90.0}
-    searches = [RobotSearch(name, found, truth, outline, (10.0, 60.0)) for name in ("naive", "SSF")]
+    searches = {name: found for name in ("naive", "SSF")}
     found = report.DemoRun(
         calibration,
         recording,

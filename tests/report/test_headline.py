@@ -17,6 +17,9 @@ NAMES = sorted(VOCABULARY)
 PLAN = SimpleNamespace(instrumentation=Instrumentation())
 
 
+NOISE = ("quantisation", "correlated_noise")
+
+
 def found(
     verdict, combination=(), *, p_value=1e-9, after=0.5, rivals=(), shares=None, n=408, few=False, beside=(),
     withdrawn=False, shared=(), leader=(), open_beside=(),
@@ -32,6 +35,7 @@ def found(
         improvement=SimpleNamespace(p_value_after=after),
         effects=tuple(named) if combination != ("unknown",) else (),
         where=(),
+        noise=SimpleNamespace(model="+".join(name for name in combination if name in NOISE) or "white"),
         hypotheses=tuple(stated) or (Hypothesis(tuple(combination), 0.99),),
         unknown_shares=shares or {},
         too_little=few,
@@ -88,6 +92,7 @@ SLOW = "a sensor that follows slowly"
 MISSING = "Something is missing"
 SAID = [
     (found("named", ("upper_tank_overflow",)), "The model leaves out upper tank overflow."),
+    (found("named", ("lag", "quantisation")), f"The model leaves out {SLOW}."),
     (found("named", ("flicker", "backlash")), "The model leaves out a flickering lamp and backlash (play) of the arm."),
     (
         found("cannot_tell", ("lag",), rivals=(("lag", "outliers"), ("backlash", "outliers"))),

@@ -5,7 +5,7 @@ import io
 import numpy as np
 from PIL import Image
 
-from probewise.report.pictures import animated_gif
+from probewise.report.exploration import animated_gif
 
 
 def png(colour, size):

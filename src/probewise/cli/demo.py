@@ -31,7 +31,7 @@ from probewise.experiment import (
 from probewise.inquiry import ReadingEntropy
 from probewise.progress import Progress
 from probewise.recordings import read_recording, shipped
-from probewise.scene import Circle, Field, outlines
+from probewise.scene import Circle, Field
 from probewise.world import saturation
 from probewise.world.shipped import true_world as world_behind
 
@@ -84,12 +84,7 @@ def _run_demo(out: Path, *, seed: int, full: bool, progress: Progress) -> tuple[
             future.result()
             progress(doing, done, 6)
     diagnosis, prediction = diagnosing.result(), predict(sensor, recording.plan, recording.readings)
-    means, known = sensor.mean(), dict(zip(_CIRCLE.prior.names, truth, strict=True))
-    outline_mm, levels = outlines(_CIRCLE.region(np.array([truth])))[0], (means["I_min"], means["I_max"])
-    searches, doubted = (
-        [report.RobotSearch(name, run.result(), known, outline_mm, levels) for name, run in runs.items()]
-        for runs in (searching, doubting)
-    )
+    searches, doubted = ({name: run.result() for name, run in runs.items()} for runs in (searching, doubting))
     concealed = ", ".join(effect.name for effect in world_behind("concealed").concealed)
     geometry = read_geometry(shipped_geometry_path())
     found = report.DemoRun(calibration, recording, prediction, searches, doubted, diagnosis, geometry, concealed, seed)
@@ -107,7 +102,10 @@ def _run_demo(out: Path, *, seed: int, full: bool, progress: Progress) -> tuple[
         each.write_results(output, progress=progress)
     return drawings, [
         *dict.fromkeys(note for each in drawings for note in each.notes),
-        *(f"{s.model} robot: {s.n} readings, off by {s.largest_error_mm:.1f} mm" for s in searches),
+        *(
+            f"{k} robot: {len(v.steps)} readings, off by {report.largest_error_mm(v):.1f} mm"
+            for k, v in searches.items()
+        ),
         report.summary_sentence(searches),
         f"diagnosis of the second recording: {diagnosis.verdict}, "
         f"{' + '.join(diagnosis.combination) or 'nothing'}; concealed was: {found.concealed}",
@@ -136,12 +134,13 @@ def _search(
         world = replace(world, concealed=(saturation(saturates_at),))
     experiment = experiment_for(sensor, _CIRCLE, field, n_live=N_LIVE_ROBOT, **{"trust": 1.0, **options})
     rng = np.random.default_rng([seed, stream])
-    with arm_over(world, HiddenShape("circle", _CIRCLE, np.array(truth)).surface, field, seed=seed) as arm:
+    hidden = HiddenShape("circle", _CIRCLE, np.array(truth))
+    with arm_over(world, hidden.surface, field, seed=seed) as arm:
         x_mm, y_mm, radius_mm = truth
         away, turn = np.random.default_rng([seed, 5]).random(2)
         away_mm, turn_rad = radius_mm * np.sqrt(away), 2 * np.pi * turn
         first = Pose(float(x_mm + away_mm * np.cos(turn_rad)), float(y_mm + away_mm * np.sin(turn_rad)))
-        return run_from_place(first, arm, experiment, rng=rng, max_readings=max_readings)
+        return replace(run_from_place(first, arm, experiment, rng=rng, max_readings=max_readings), hidden=hidden)
 
 
 def diagnose_shipped_recording(seed: int) -> Diagnosis:

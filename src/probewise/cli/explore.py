@@ -33,7 +33,6 @@ from probewise.inference import Naive
 from probewise.progress import Progress
 from probewise.recordings import read_recording, shipped
 from probewise.report import exploration as report
-from probewise.report.pictures import animated_gif
 from probewise.scene import SHAPES, Card, Field
 from probewise.verbs import DEFAULT_SEED, calibrate, naive_levels
 
@@ -279,7 +278,7 @@ class Search:
                 draw=self.drawings.draw,
             )
 
-        animation = {"run.gif": lambda: animated_gif([frame for frame in self.frames if frame])}
+        animation = {"run.gif": lambda: report.animated_gif([frame for frame in self.frames if frame])}
         made = report.output_of(result, seed=seed)._replace(drawers=animation, page=page)
         self.drawings.write_results(made, inputs=self.files, adds=True, progress=progress)
 

@@ -328,11 +328,15 @@ def _without_copies_of_reading(simulator: Simulator, table: RunTable) -> RunTabl
     return table
 
 
+_MOST_WITHOUT_COLUMN = 0.1  # of the readings: the rest tells the noise nearly as well
+
+
 def without_unpredictable_readings(system: System, recording: RunRecording, *, every_row: bool = False) -> RunRecording:
     """Leave out, with a note, the readings of rows in which a missing column makes a prediction impossible.
 
-    If there is such a row, missing values of all columns are interpolated from the other rows of the run, so that
-    effects with a memory, such as backlash, are defined in later rows.
+    Missing values of all columns are interpolated from the other rows of the run, so that effects with a memory, such
+    as backlash, are defined in later rows; if `every_row`, also those that only effects read. Readings there are left
+    out too unless that would cost more than a tenth, as of a column that was logged less often.
 
     Raises ParameterError if the simulator gives no finite reading in a row where no column is missing: one with a
     reading or, if `every_row`, any, since the change by an effect would not be finite there.
@@ -341,11 +345,12 @@ def without_unpredictable_readings(system: System, recording: RunRecording, *, e
     there = np.isfinite(system.chain(table, ()).predict(system.theta(system.starts), table))
     unpredictable = ~there[there.any(axis=1)].any(axis=0) if there.any() else np.ones(len(table), dtype=np.bool_)
     lost = unpredictable & recording.usable
-    if not unpredictable.any():
-        return recording
     inputs, missing = system.simulator.inputs(table.covariates), np.zeros(len(table), dtype=np.bool_)
+    with_gaps = [name for name, values in inputs.items() if 0 < np.isfinite(values).sum() < len(values)]
     for values in inputs.values():
         missing |= ~np.isfinite(values)
+    if not unpredictable.any() and not (every_row and with_gaps):
+        return recording
     gaps = np.flatnonzero(missing)
     if law is not None:  # what is missing once is missing to the end of its run
         for rows in table.rows_by_scan():
@@ -355,8 +360,16 @@ def without_unpredictable_readings(system: System, recording: RunRecording, *, e
         where = f"no finite reading in {len(wrong)} of {len(table)} rows, first in row {wrong[0] + table.first_line}"
         allowed = "a finite reading in each row somewhere in the prior, or a table without these rows"
         raise ParameterError("simulate" if law is None else "rates", where, allowed)
-    filled = table.with_columns({name: table.interpolated_within_runs(values) for name, values in inputs.items()})
+    filled = table.with_columns({name: table.interpolated_within_runs(inputs[name]) for name in with_gaps})
     recording = replace(recording, plan=cast(Plan, filled))
+    for name in with_gaps if every_row else ():
+        beside = recording.usable & ~lost & ~np.isfinite(inputs[name])
+        if 0 < beside.sum() <= _MOST_WITHOUT_COLUMN * recording.usable.sum():
+            readings = count_with_noun(int(beside.sum()), "reading")
+            recording = _without_readings(recording, beside, f"{readings} left out: column {name!r} is missing there")
+        elif beside.any():
+            note = f"column {name!r} is missing at {int(beside.sum())} readings; it is interpolated within each run"
+            recording = replace(recording, notes=(*recording.notes, note))
     if not lost.any():
         return recording
     why = "simulator reads is missing there"

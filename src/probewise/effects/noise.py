@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import TINY, FloatArray, varies
-from probewise._words import value_with_sd
+from probewise._words import unit_after_number, value_with_sd
 from probewise.effects.effect import (
     Act,
     Declared,
@@ -319,6 +319,12 @@ def _dropouts_in_words(lost: tuple[float, ...], unit: str, mean: FloatArray, sd:
     return f"readings are lost: {share} % of them read {value}, whatever the true value"
 
 
+def _rounding_in_words(unit: str, mean: FloatArray, sd: FloatArray) -> str:
+    """Write the step without an sd: readings on a lattice tell it to the last digit."""
+    size = f"{mean[0]:.4g} {unit}".rstrip()
+    return f"the readings are rounded to steps of {size}, which were not declared"
+
+
 ROUNDING_SEEN_ABOVE = 0.3
 """Smallest step, in noise sds, that counts: a finer lattice is only the printing of digits."""
 
@@ -328,8 +334,8 @@ def quantisation(kind: LightEffect, of: Extent) -> Effect | None:
     """Readings rounded to a step that was not declared: step round(reading / step), after the noise."""
     if of.plan.instrumentation.step is not None:
         return None
-    says = in_words("the readings are rounded to steps of {0}, which were not declared", of.reading_unit)
     step, act = LogUniform(1e-3 * of.span, 0.2 * of.span), acting(lambda noise, plan, step: replace(noise, step=step))
+    says = partial(_rounding_in_words, unit_after_number(of.reading_unit))
     return _on_noise(kind, of, {"step": (step, "reading")}, act, says, (16,), from_prior=False)  # from the readings
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,6 +28,7 @@ _MOST_ORIENTATIONS = 24  # with a name each on the axis
 _SEEN = 2.3  # sds beyond which a mean visibly leaves the band
 _N_SAMPLES = 200  # posterior samples for the variance that the fit absorbs
 _ASTRAY = 0.01  # largest deviation of a scan from its line, as a share of its length
+_GAP = 0.1  # of the longest run, for a gap that is left out
 _LEAST_PLACES = 3  # least number of places in a line
 
 
@@ -86,6 +87,20 @@ def category_name_by_value(diagnosis: Diagnosis, place: Place) -> dict[float, st
     if place.covariate == "orientation" and len(there) <= _MOST_ORIENTATIONS:
         return {angle: f"{angle:g}°" for angle in there}
     return None
+
+
+def time_without_gaps(plan: Plan | RunTable, name: str) -> tuple[Callable[[FloatArray], FloatArray], str]:
+    """Return how to draw times of a table: gaps longer than every run are left out; and words that say so, or "".
+
+    Other covariates, by `name`, and times without such gaps are drawn as they are.
+    """
+    times = np.unique(plan.time_s[np.isfinite(plan.time_s)])
+    longest = max(float(np.ptp(plan.time_s[rows])) for rows in plan.rows_by_scan())
+    gaps = np.diff(times)
+    if name != "time" or not isinstance(plan, RunTable) or not 0 < longest < gaps.max(initial=0.0):
+        return np.asarray, ""
+    drawn = np.cumsum(np.append(0.0, np.where(gaps > longest, _GAP * longest, gaps)))
+    return lambda values: np.interp(values, times, drawn), ", gaps left out"
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,6 +208,9 @@ def views_of_place(diagnosis: Diagnosis, place: Place) -> list[CovariateView]:
         unit = unit_after_number(diagnosis.recording.plan.instrumentation.unit)
         label = f"reading to be expected without it ({unit})"
     window = None if place.start is None or place.end is None else (place.start, place.end)
+    draw, said = time_without_gaps(diagnosis.recording.plan, place.covariate)
+    at, label = draw(at), label + said
+    window = None if window is None else (float(draw(np.array(window))[0]), float(draw(np.array(window))[1]))
     values = _distinct_values(at)
     if names:
         held = [k for k, v in enumerate(values) if (window[0] <= v <= window[1] if window else names[v] == place.scan)]

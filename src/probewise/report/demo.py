@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 
-from probewise._arrays import FloatArray
 from probewise._words import count_with_noun
 from probewise.arm import Geometry
 from probewise.calibration import Calibration
@@ -20,7 +18,7 @@ from probewise.recordings import Prediction, Recording
 from probewise.report import calibration as calibration_report
 from probewise.report import diagnosis as diagnosis_report
 from probewise.report.diagnosis_figures import before_and_after
-from probewise.report.exploration import draw_robot_view, draw_widths_and_information
+from probewise.report.exploration import draw_view_after, draw_widths_and_information
 from probewise.report.html import Markup, Section, element, figures, page, paragraph, table
 from probewise.report.plots.apparatus import draw_arm_lengths
 from probewise.report.plots.canvas import PAGE_IN, AxesGrid, grid_of_axes, png
@@ -47,44 +45,12 @@ _CAPTIONS = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class RobotSearch:
-    """One robot's search: its name, its run, the true shape, and the readings over black and white.
-
-    `truth` holds the shape's parameters by name, `truth_mm` its outline, (n_vertices, 2); `levels` is (black, white).
-    """
-
-    model: str
-    run: Exploration
-    truth: Mapping[str, float]
-    truth_mm: FloatArray
-    levels: tuple[float, float]
-
-    @property
-    def n(self) -> int:
-        """Number of readings."""
-        return len(self.run.steps)
-
-    @property
-    def largest_error_mm(self) -> float:
-        """Largest absolute error, estimate against truth, of the parameters in mm (places, lengths) at the end."""
-        last = self.run.last
-        return max(
-            abs(float(mean) - self.truth[name])
-            for name, mean in zip(last.names, last.mean, strict=True)
-            if name in self.truth and name.endswith("_mm")
-        )
-
-    def step_after(self, n: int) -> Step:
-        """Return the step after `n` readings, or the last one if the run ended earlier."""
-        return self.run.steps[min(n, self.n) - 1]
-
-    def draw_view(self, step: Step, *, ax: Axes) -> Axes:
-        """Draw the robot's view after a step, with the true shape; return the axes."""
-        seen = [(r.pose.x_mm, r.pose.y_mm, r.value) for r in self.run.readings[: step.number]]
-        title = f"{self.model}, {count_with_noun(step.number, 'reading')}: sd up to {_sd_text(step)}"
-        more: dict[str, Any] = {"levels": self.levels, "truth_mm": self.truth_mm, "title": title, "ax": ax}
-        return draw_robot_view(step, self.run.experiment, seen, **more)
+def largest_error_mm(run: Exploration) -> float:
+    """Return the largest absolute error, posterior mean against truth, of the parameters in mm at the end of a run."""
+    last = run.last
+    truth = {} if run.hidden is None else run.hidden.parameters_by_hypothesis_name(last.names)
+    mean = dict(zip(last.names, last.mean, strict=True))
+    return max(abs(float(mean[name]) - true) for name, true in truth.items() if name.endswith("_mm"))
 
 
 def _sd_text(step: Step) -> str:
@@ -94,37 +60,47 @@ def _sd_text(step: Step) -> str:
 _HEADER = ("robot", "readings", "bits", "bits per reading", "largest error", "widest posterior sd", "stopped because")
 
 
-def _comparison_rows(searches: Sequence[RobotSearch]) -> list[tuple[str, ...]]:
+def _comparison_rows(searches: Mapping[str, Exploration]) -> list[tuple[str, ...]]:
     """Return the cells of the table of searches, in the order of `_HEADER`, one row per search."""
     return [
         (
-            s.model,
-            str(s.n),
-            number_text(s.run.last.bits, 1),
-            number_text(s.run.bits_per_reading, 2),
-            f"{number_text(s.largest_error_mm, 1)} mm",
-            _sd_text(s.run.last),
-            s.run.stop_reason,
+            name,
+            str(len(run.steps)),
+            number_text(run.last.bits, 1),
+            number_text(run.bits_per_reading, 2),
+            f"{number_text(largest_error_mm(run), 1)} mm",
+            _sd_text(run.last),
+            run.stop_reason,
         )
-        for s in searches
+        for name, run in searches.items()
     ]
 
 
-def draw_views(searches: Sequence[RobotSearch], n: int) -> AxesGrid:
+def draw_views(searches: Mapping[str, Exploration], n: int) -> AxesGrid:
     """Draw each robot's view after `n` readings (or its last), side by side, of one part of the field; return the axes.
 
     The part holds all readings, the circles drawn from each posterior and the true ones.
     """
-    steps, grid = [s.step_after(n) for s in searches], searches[0].run.experiment.grid
-    points = [np.array([[r.pose.x_mm, r.pose.y_mm] for s in searches for r in s.run.readings])]
-    for s, step in zip(searches, steps, strict=True):
-        points += [s.truth_mm, *outlines(s.run.experiment.shape.region(step.samples))]
+    steps = {name: run.steps[:n][-1] for name, run in searches.items()}
+    grid = next(iter(searches.values())).experiment.grid
+    points = []
+    for name, run in searches.items():
+        points += [np.array([[r.pose.x_mm, r.pose.y_mm] for r in run.readings])]
+        points += outlines(run.experiment.shape.region(steps[name].samples))
+        points += [] if run.hidden is None else [run.hidden.outline_mm]
     (left, low), (right, high) = (end(np.concatenate(points), axis=0) for end in (np.min, np.max))
     left, low = max(left - _MARGIN_MM, 0.0), max(low - _MARGIN_MM, 0.0)
     right, high = min(right + _MARGIN_MM, grid.width_mm), min(high + _MARGIN_MM, grid.height_mm)
+    sides = ((grid.x_mm, left, right), (grid.y_mm, low, high))
     axes = grid_of_axes(1, len(searches), size_in=(PAGE_IN, 1.6 + 3.6 * (high - low) / (right - left)))
-    for ax, s, step in zip(axes[0], searches, steps, strict=True):
-        s.draw_view(step, ax=ax).set(xlim=(left, right), ylim=(low, high))
+    for ax, (name, run) in zip(axes[0], searches.items(), strict=True):
+        step = steps[name]
+        title = f"{name}, {count_with_noun(step.number, 'reading')}: sd up to {_sd_text(step)}"
+        draw_view_after(run, step.number, title=title, ax=ax).set(xlim=(left, right), ylim=(low, high))
+        (columns,), (rows,) = (np.nonzero((at >= a) & (at <= b)) for at, a, b in sides)
+        if np.isfinite(step.map.image[np.ix_(rows, columns)]).all():
+            for patch in ax.patches:  # no place out of reach is in this part
+                patch.set_label("")
     draw_field_legend(axes)
     return axes
 
@@ -134,37 +110,37 @@ class DemoRun:
     """Everything that a demo has found.
 
     `searches` are the naive and the SSF robot's from the same first reading, with places chosen by the paper's rule;
-    `doubt` is the search of a trusting and of a doubting robot. `diagnosis` is that of the second recording, whose
-    simulated world `concealed` the effect of that name.
+    `doubt` are those of a trusting and of a doubting robot; by name, the hidden circle included. `diagnosis` is that of
+    the second recording, whose simulated world `concealed` the effect of that name.
     """
 
     calibration: Calibration
     recording: Recording
     prediction: Prediction
-    searches: Sequence[RobotSearch]
-    doubt: Sequence[RobotSearch]
+    searches: Mapping[str, Exploration]
+    doubt: Mapping[str, Exploration]
     diagnosis: Diagnosis
     geometry: Geometry
     concealed: str
     seed: int
 
 
-def summary_sentence(searches: Sequence[RobotSearch]) -> str:
+def summary_sentence(searches: Mapping[str, Exploration]) -> str:
     """State in one sentence how many readings the SSF and the naive robot needed after the same first reading."""
-    naive, ssf = (s.n - 1 for s in searches)
-    how = "" if all(s.run.target_reached for s in searches) else " (not every run reached that)"
+    naive, ssf = (len(run.steps) - 1 for run in searches.values())
+    how = "" if all(run.target_reached for run in searches.values()) else " (not every run reached that)"
     return (
         f"After the same first reading on white, the robot that knows what its sensor sees needed {ssf} more readings "
         f"to know the circle to 4 mm; the naive robot needed {naive}{how}."
     )
 
 
-def _sds_after_equal_readings_text(searches: Sequence[RobotSearch]) -> str:
+def _sds_after_equal_readings_text(searches: Mapping[str, Exploration]) -> str:
     """Compare both robots' widest posterior sds (mm) after as many readings as the SSF robot, the second, needed."""
-    naive, ssf = searches
+    naive, ssf = (run.steps for run in searches.values())
     return (
-        f"After {count_with_noun(ssf.n, 'reading')} each, the naive robot knows the circle to "
-        f"{_sd_text(naive.step_after(ssf.n))}, the other to {_sd_text(ssf.run.last)} (widest posterior sd)."
+        f"After {count_with_noun(len(ssf), 'reading')} each, the naive robot knows the circle to "
+        f"{_sd_text(naive[: len(ssf)][-1])}, the other to {_sd_text(ssf[-1])} (widest posterior sd)."
     )
 
 
@@ -185,14 +161,15 @@ def main_findings_by_key(run: DemoRun) -> dict[str, str | int]:
 
 def figure_drawers(run: DemoRun) -> dict[str, Callable[[], bytes]]:
     """List all figures of the demo by file name, as functions that draw PNGs."""
-    doubting = run.doubt[-1].run
+    *_, searched = (len(each.steps) for each in run.searches.values())
+    *_, doubting = run.doubt.values()
     beliefs = [left_out_after_step(step, doubting.experiment.trust).probability for step in doubting.steps]
     drawings: dict[str, Callable[[], Axes | AxesGrid]] = {
         "arm.png": lambda: draw_arm_lengths(run.geometry),
-        "equal_readings.png": lambda: draw_views(run.searches, run.searches[-1].n),
-        "progress.png": lambda: draw_widths_and_information({f"{s.model} model": s.run.steps for s in run.searches}),
+        "equal_readings.png": lambda: draw_views(run.searches, searched),
+        "progress.png": lambda: draw_widths_and_information({f"{k} model": v.steps for k, v in run.searches.items()}),
         "before_after.png": lambda: before_and_after(run.diagnosis),
-        "doubt.png": lambda: draw_views(run.doubt, max(s.n for s in run.doubt)),
+        "doubt.png": lambda: draw_views(run.doubt, max(len(each.steps) for each in run.doubt.values())),
         "belief.png": lambda: effect_probabilities_by_reading(beliefs),
     }
     return calibration_report.figure_drawers(run.calibration, run.recording, run.prediction) | {
@@ -233,7 +210,7 @@ def page_html(run: DemoRun, drawn: Mapping[str, bytes], *, seconds: float) -> st
         Section("The sensor", (_SENSOR, calibration_report.summary_sentence(sensor)), of_sensor),
         Section("The search", searching),
         _diagnosis_section(run.diagnosis, shown, run.concealed),
-        doubt_section(run.doubt, drawn),
+        doubt_section(run.doubt, drawn, white=sensor.mean()["I_max"]),
         Section("This run", (facts,)),
     ]
     title, answer = "Modeling a sensor to improve its efficacy", summary_sentence(run.searches)
@@ -251,22 +228,25 @@ def _diagnosis_section(diagnosis: Diagnosis, shown: Mapping[str, Markup], concea
     return Section("A mismatch, found and repaired", (summary, said, shown["before_after.png"], more))
 
 
-def doubt_sentence(searches: Sequence[RobotSearch]) -> str:
+def doubt_sentence(searches: Mapping[str, Exploration]) -> str:
     """Say in one sentence how both robots ended (readings, largest error, widest sd), the trusting one first."""
     trusting, doubting = (
-        f"{count_with_noun(s.n, 'reading')}, off by {number_text(s.largest_error_mm, 1)} mm "
-        f"(posterior sd up to {_sd_text(s.run.last)})"
-        for s in searches
+        f"{count_with_noun(len(run.steps), 'reading')}, off by {number_text(largest_error_mm(run), 1)} mm "
+        f"(posterior sd up to {_sd_text(run.last)})"
+        for run in searches.values()
     )
     return f"The robot that trusts its sensor model took {trusting}; the one that doubts it took {doubting}."
 
 
-def doubt_section(searches: Sequence[RobotSearch], drawn: Mapping[str, bytes]) -> Section:
-    """Build the demo's section from both searches, the trusting robot's first, and from `figure_drawers`."""
-    doubting, shown = searches[-1].run, figures(drawn, _CAPTIONS)
+def doubt_section(searches: Mapping[str, Exploration], drawn: Mapping[str, bytes], *, white: float) -> Section:
+    """Build the demo's section from both searches, the trusting robot's first, and from `figure_drawers`.
+
+    `white` is the reading over white that the sensor model expects.
+    """
+    (*_, doubting), shown = searches.values(), figures(drawn, _CAPTIONS)
     introduction = (
         f"A third world conceals a fault: its sensor saturates at {SATURATION:g} LEGO units, where white would read "
-        f"{number_text(searches[0].levels[1], 0)}. The sensor model leaves that out. One robot trusts the model. "
+        f"{number_text(white, 0)}. The sensor model leaves that out. One robot trusts the model. "
         f"The other expects with probability {1 - doubting.experiment.trust:.1g} that an effect is missing; "
         "it compares the plain model with each effect that could act, and chooses its readings and its end under all "
         "of them."

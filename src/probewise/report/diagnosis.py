@@ -57,6 +57,7 @@ from probewise.report.words import (
     probability_text,
     range_text,
     typeset_numbers,
+    value_with_error,
 )
 from probewise.systems import RunTable, run_table_csv, write_fitted_system
 from probewise.verbs import DEFAULT_SEED
@@ -65,6 +66,7 @@ __all__ = ["figure_drawers", "output_of", "page_html", "sections", "summary_sent
 
 _MOST_ALIASES = 8
 _MOST_PLACES = 3
+_MOST_PARAMETERS = 12
 _LIKELY = 0.05  # probability of an effect from which it has a paragraph of its own
 _CHANCE = 0.05  # p-value above which chance is a sufficient explanation
 _NOISE_CAPTIONS = {
@@ -230,8 +232,11 @@ def _next_readings_in_words(diagnosis: Diagnosis) -> str:
 
 def _explanation_elements(diagnosis: Diagnosis) -> Sequence[str]:
     credible = [hypothesis_in_words(() if k == "clean" else k.split("+")) for k in diagnosis.credible]
-    likely = [e for e in diagnosis.effects if e.probability > _LIKELY]
-    told = [f"{effect_in_words(e.name)} ({probability_text(e.probability)}): {e.sentence}" for e in likely]
+    likely = sorted((e for e in diagnosis.effects if e.probability > _LIKELY), key=lambda e: -e.size_lambda)
+    told = [
+        f"{effect_in_words(e.name)} ({probability_text(e.probability)}, alone or beside others): {e.sentence}"
+        for e in likely
+    ]
     held = f"95 % credible set (the fewest explanations that hold 0.95): {'; '.join(credible)}."
     candidates = ", ".join(
         f"{effect_in_words(name) if effect_has_words(name) else term_family_in_words(name)} ({probability_text(p)})"
@@ -301,12 +306,26 @@ def _before_and_after_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes])
     curves = [effect for effect in diagnosis.effects if figure_name_of(effect.name) in drawn]
     return (
         html.figure(drawn["before_after.svg"], before_and_after_caption(diagnosis)),
+        *_parameter_elements(diagnosis),
         html.figure(drawn["residuals.svg"], against),
         *(
             html.figure(drawn[figure_name_of(e.name)], _as_sentence(diagnosis, f"With the 95 % band: {e.sentence}"))
             for e in curves
         ),
     )
+
+
+def _parameter_elements(diagnosis: Diagnosis) -> Sequence[str]:
+    """Build the table of a simulator's parameters in both models; folded away if they are many. A sensor has a file."""
+    if not isinstance(diagnosis.recording.plan, RunTable):
+        return ()
+    models = [(diagnosis.apparatus.words.before_in_words, diagnosis.null)]
+    models += [(diagnosis.after_in_words, diagnosis.repaired)] * diagnosis.repair_changes_predictions
+    columns = [dict(zip(model.chain.names, model.theta.T, strict=True)) for _, model in models]
+    names = [name for name in columns[0] if name in columns[-1]]
+    rows = [(k, *(value_with_error(float(c[k].mean()), float(c[k].std())) for c in columns)) for k in names]
+    listed = html.table(("parameter of the simulator", *(name for name, _ in models)), rows)
+    return (listed,) if len(rows) <= _MOST_PARAMETERS else (html.details(f"{len(rows)} parameters", listed),)
 
 
 def _heldout_gain_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> Sequence[str | Mapping[str, str]]:
@@ -374,8 +393,12 @@ def _alias_elements(diagnosis: Diagnosis) -> Sequence[str]:
         return ("None: these readings tell apart all effects of the vocabulary that they can detect.",)
     first, rest = ranked[:_MOST_ALIASES], ranked[_MOST_ALIASES:]
     said = "While they are small, the effects of a pair change these readings alike; larger ones may differ, as the "
+    said += "probabilities above say."
+    if diagnosis.is_settled:
+        said = f"None of these pairs leaves this diagnosis open. {said}"
+        return (said, html.details(f"{count_with_noun(len(ranked), 'pair')}", _alias_table(ranked)))
     folded = (html.details(f"{len(rest)} more pairs", _alias_table(rest)),) if rest else ()
-    return (f"{said}probabilities above say.", _alias_table(first), *folded)
+    return (said, _alias_table(first), *folded)
 
 
 def _alias_table(aliases: Sequence[Alias]) -> html.Markup:

@@ -20,6 +20,7 @@ from probewise.report.covariates import (
     ResidualNoise,
     axis_label,
     is_scan_along_line,
+    time_without_gaps,
     view_along_scan,
     views_of_place,
 )
@@ -175,7 +176,8 @@ def _all_residuals_svg(diagnosis: Diagnosis) -> bytes:
     models = [(unrepaired, diagnosis.before.residuals), (diagnosis.after_in_words, diagnosis.after.residuals)]
     models = models if diagnosis.repair_changes_predictions else models[:1]
     time = axis_label(diagnosis, "row" if isinstance(plan, RunTable) and not plan.has_varying_time else "time")
-    covariates = ((time, plan.time_s), (axis_label(diagnosis, "level"), diagnosis.before.readings))
+    draw, said = time_without_gaps(plan, "time")
+    covariates = ((time + said, draw(plan.time_s)), (axis_label(diagnosis, "level"), diagnosis.before.readings))
     unit = unit_after_number(plan.instrumentation.unit)
     return svg(plots.residuals_against_covariates(covariates, models, unit=unit))
 

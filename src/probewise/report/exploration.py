@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
 from functools import cache, partial
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from PIL import Image
 
 from probewise._arrays import FloatArray
 from probewise._words import count_with_noun, unit_after_number, unit_of_name
 from probewise._writing import Output, StagedFiles
 from probewise.effects import spoken_name
+from probewise.errors import require
 from probewise.experiment import (
     CLEAN,
     Experiment,
@@ -27,7 +30,6 @@ from probewise.experiment import (
 )
 from probewise.experiment.result import WRONG_MM, stop_reason_with_checks
 from probewise.report import html
-from probewise.report.pictures import animated_gif
 from probewise.report.plots.canvas import PAGE_IN, AxesGrid, axes_of_frame, grid_of_axes, png
 from probewise.report.plots.probabilities import effect_probabilities_by_reading
 from probewise.report.plots.search import draw_field_legend, information_gained, playing_field, posterior_widths
@@ -44,6 +46,8 @@ from probewise.sensor import Chain
 from probewise.verbs import DEFAULT_SEED
 
 MODEL_NAMES = {"ssf": "SSF"}
+_COLOURS = 256  # of a GIF
+_FRAME_S, _LAST_S = 0.8, 3.0
 _LEAST_SHOWN = 1e-3  # probability of an effect, to be listed in the table
 _MOST_SHOWN = 6
 
@@ -97,9 +101,14 @@ def robot_view_png(
     return png(ax, dpi=90, tight=False)
 
 
+def draw_view_after(run: Exploration, number: int, *, title: str = "", ax: Axes | None = None) -> Axes:
+    """Draw the robot's view after the reading of this number, from 1; return the axes."""
+    return draw_robot_view(run.steps[number - 1], run.experiment, **_seen(run, number), title=title, ax=ax)
+
+
 def draw_last_view(run: Exploration) -> Axes:
     """Draw the robot's view at the end of a run, with its legend, in a figure of its own; return the axes."""
-    ax = draw_robot_view(run.last, run.experiment, **_seen(run))
+    ax = draw_view_after(run, len(run.steps))
     draw_field_legend(ax)
     return ax
 
@@ -109,7 +118,7 @@ def frame_png(run: Exploration, number: int) -> bytes:
     return robot_view_png(run.steps[number - 1], run.experiment, **_seen(run, number))
 
 
-def _seen(run: Exploration, number: int | None = None) -> dict[str, Any]:
+def _seen(run: Exploration, number: int) -> dict[str, Any]:
     """Return the first readings of a run, their lowest and highest level, and the true outline if it is known."""
     readings, values = run.readings[:number], [r.value for r in run.readings]
     return {
@@ -178,6 +187,29 @@ def draw_widths_and_information(runs: Mapping[str, Sequence[Step]], *, target_mm
     posterior_widths(widths, target_mm=target_mm, ax=axes[0, 0])
     information_gained({name: np.array([s.bits for s in steps]) for name, steps in runs.items()}, ax=axes[0, 1])
     return axes
+
+
+def animated_gif(frames: Sequence[bytes], *, frame_s: float = _FRAME_S, last_s: float = _LAST_S) -> bytes:
+    """Join one or more PNGs of one size into an animated GIF that loops for ever."""
+    require(frames, "frames", 0, "one picture or more")
+    sheets = [Image.open(io.BytesIO(frame)).convert("RGB") for frame in frames]
+    palette = _common_palette(sheets)
+    sheets = [sheet.quantize(palette=palette, dither=Image.Dither.NONE) for sheet in sheets]
+    durations = [round(1000 * frame_s)] * (len(sheets) - 1) + [round(1000 * last_s)]
+    out = io.BytesIO()
+    sheets[0].save(out, "GIF", save_all=True, append_images=sheets[1:], duration=durations, loop=0)
+    return out.getvalue()
+
+
+def _common_palette(sheets: Sequence[Image.Image]) -> Image.Image:
+    """Return a palette image of 256 colours that all frames share; with one palette each, a colour would change.
+
+    The palette covers the range of colours, whatever their frequency, so that small squares keep their rare colours.
+    """
+    weights = np.array([1 << 16, 1 << 8, 1], dtype=np.uint32)
+    codes = np.unique(np.concatenate([np.unique(np.asarray(sheet) @ weights) for sheet in sheets]))
+    colours = np.stack([codes >> 16, codes >> 8 & 255, codes & 255], axis=-1).astype(np.uint8)
+    return Image.fromarray(colours[None]).quantize(_COLOURS, method=Image.Quantize.MAXCOVERAGE)
 
 
 def summary_sentence(run: Exploration) -> str:

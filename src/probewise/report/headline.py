@@ -35,6 +35,7 @@ def _verdict_versions(diagnosis: Diagnosis) -> list[str]:
         if n > 1 and float(np.ptp(diagnosis.recording.readings[diagnosis.recording.usable])) == 0.0:
             return [f"All {n} readings are equal: there is no signal to diagnose."]
         return [f"{count_with_noun(n, 'reading').capitalize()} {'is' if n == 1 else 'are'} too few for a diagnosis."]
+    noise, stated = diagnosis.noise.model.split("+"), list(diagnosis.stated)
     match diagnosis.verdict:
         case "clean" if diagnosis.p_value < ALARM:
             said = ["These readings look unusual, but nothing that was tried explains them better than the model."]
@@ -46,13 +47,19 @@ def _verdict_versions(diagnosis: Diagnosis) -> list[str]:
             return _undecided_versions(diagnosis)
         case "noise":
             unlike = "what it was" if diagnosis.stated == (noise_sd.name,) else "white"
-            said = _left_out_versions(diagnosis, f"The predicted mean is right, but the noise is not {unlike}:")
+            said = _left_out_versions(diagnosis, f"The predicted mean is right, but the noise is not {unlike}:", stated)
         case "named":
             more = " Something more is missing." if diagnosis.improvement.p_value_after < ALARM else ""
-            *plain, last = _left_out_versions(diagnosis, "The model leaves out")
+            stated = [name for name in stated if name not in noise] or stated
+            *plain, last = _left_out_versions(diagnosis, "The model leaves out", stated)
             beside = [f"{plain[0][:-1]}; besides, {either}." for either in _open_beside_shared(diagnosis)]
             # With sizes first; a name before that more is missing.
-            listed = [(one, rest) for own in (_told_with_sizes(diagnosis), plain) for rest in (more, "") for one in own]
+            listed = [
+                (one, rest)
+                for own in (_told_with_sizes(diagnosis, stated), plain)
+                for rest in (more, "")
+                for one in own
+            ]
             return [*beside, *_with_rivals(diagnosis, [*listed, (last, more), (last, "")])]
     return _with_rivals(diagnosis, [(one, "") for one in said])
 
@@ -71,18 +78,18 @@ def _with_rivals(diagnosis: Diagnosis, versions: Sequence[tuple[str, str]]) -> l
     return [f"{first[:-1]}{rival}{rest}" for rival in (*told, ".") for first, rest in versions]
 
 
-def _told_with_sizes(diagnosis: Diagnosis) -> list[str]:
-    """Return the sentence on the effects that the verdict states, with sizes and dates; none if one lacks it."""
+def _told_with_sizes(diagnosis: Diagnosis, stated: Sequence[str]) -> list[str]:
+    """Return the sentence on the effects `stated`, with sizes and dates; none if one lacks it."""
     told = {effect.name: effect.sentence for effect in diagnosis.effects if effect.sentence}
-    if not all(name in told for name in diagnosis.stated):
+    if not all(name in told for name in stated):
         return []
-    joined = diagnosis.apparatus.words.as_sentence("; ".join(told[name] for name in diagnosis.stated))
+    joined = diagnosis.apparatus.words.as_sentence("; ".join(told[name] for name in stated))
     return [typeset_numbers(f"{joined}.")]
 
 
-def _left_out_versions(diagnosis: Diagnosis, opening: str) -> list[str]:
+def _left_out_versions(diagnosis: Diagnosis, opening: str, stated: Sequence[str]) -> list[str]:
     sizes = {effect.name: effect.size_lambda for effect in diagnosis.effects}
-    names = effects_in_words(sorted(diagnosis.stated, key=lambda k: -sizes.get(k, 0.0)))
+    names = effects_in_words(sorted(stated, key=lambda k: -sizes.get(k, 0.0)))
     if len(names) == 1:
         return [f"{opening} {names[0]}.", f"{opening} one effect."]
     return [

@@ -35,7 +35,16 @@ class ResidualMeans:
     @property
     def largest_mean_in_sds(self) -> float:
         """Largest absolute mean of `before`, in sds of that mean by chance; 0 without bins."""
-        return float(np.max(np.abs(self.before) / np.maximum(self.chance / 1.96, 1e-300), initial=0.0))
+        return float(self._in_sds.max(initial=0.0))
+
+    def is_largest_within(self, window: tuple[float, float]) -> bool:
+        """Return whether the largest absolute mean, in sds of chance, lies in an interval of the covariate."""
+        within = (self.at >= window[0]) & (self.at <= window[1])
+        return bool(self._in_sds[within].max(initial=0.0) >= self._in_sds.max(initial=0.0))
+
+    @property
+    def _in_sds(self) -> FloatArray:
+        return np.abs(self.before) / np.maximum(self.chance / 1.96, 1e-300)
 
 
 def mean_residuals(

@@ -66,7 +66,7 @@ def typeset_numbers(text: str) -> str:
         return f"{found[1]}\u00a0×\u00a010{str(int(found[2])).translate(_RAISED)}"
 
     together = re.sub(r"\bp ([=<]) (?=\d)", "p\u00a0\\1\u00a0", text)
-    return re.sub(r"(?<![\w.])-(?=\d)", "−", re.sub(r"(\d)e([+-]\d+)", power_of_ten, together))
+    return re.sub(r"(?<![\w.])-(?=\d)", "−", re.sub(r"([\d)])e([+-]\d+)", power_of_ten, together))
 
 
 _MINUTES = {"minute": 1.0, "hour": 60.0, "day": 1440.0, "month": 43_830.0, "year": 525_960.0}

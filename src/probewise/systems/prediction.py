@@ -118,8 +118,7 @@ def predict_system(
     a row (`at_row`) counts the rows of the recording: those of a table that neither begins with the recording's rows
     nor is a contiguous part of them, readings included, come after its end. A row that lacks a number which the
     simulator or an effect needs has no prediction (NaN), and with a law the rows after it in the run neither; effects
-    that look back to it, such as a lag, take the number interpolated within the run. The effect of a column that counts
-    from its mean is 0 where the column is missing, as in the fit.
+    that look back to it, such as a lag, take the number interpolated within the run.
 
     Later rows of a recorded run follow its recorded rows, if the model has them, so that its state goes on from there,
     and so does noise with a memory: each sample's is conditional on its residuals there. A gap in time counts as the

@@ -121,16 +121,15 @@ def predicted_and_recorded_by_scan(recording: Recording, mean: FloatArray, sd: F
     axes = canvas.grid_of_axes(n_rows, n_columns, size_in=(canvas.PAGE_IN, 0.6 + 2.4 * n_rows), sharey=True)
     for ax, track in zip(axes.flat, shown, strict=False):
         _draw_track(ax, recording, track, mean, sd)
-        canvas.label_axes(ax, x="", y="", title=track.label)
+        canvas.label_axes(ax, x=_along_label([track]), y="", title=track.label)
     if alone.size:
         ax = axes.flat[len(shown)]
         _draw_single_readings(ax, recording, alone, mean, sd)
         canvas.label_axes(ax, x="", y="", title="single readings")
     for ax in list(axes.flat)[n_panels:]:
         ax.set_visible(False)
-    sheet = canvas.figure_of(axes)
-    sheet.supylabel(f"reading ({recording.plan.instrumentation.unit_after_number})", fontsize="medium")
-    sheet.supxlabel(_along_label(shown), fontsize="medium")
+    for ax in axes[:, 0]:
+        ax.set_ylabel(f"reading ({recording.plan.instrumentation.unit_after_number})")
     canvas.legend_below(axes)
     return axes
 

@@ -86,7 +86,7 @@ def mean_residuals_along(
         every = 1 + len(names) // _MOST_LABELS
         at = np.arange(len(names))[::every]
         ax.set_xticks(at, [name.replace("_", " ") for name in names[::every]], fontsize=canvas.SMALL_PT, rotation=30)
-    if window is not None:
+    if window is not None and means.is_largest_within(window):
         ax.axvspan(*window, color=canvas.SKY, alpha=0.25, label="stands out here", zorder=0)
     averaged = each is None and int(means.size.max(initial=1)) > 1
     y = f"{'mean residual' if averaged else 'residual'} ({unit})"

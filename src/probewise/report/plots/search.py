@@ -20,7 +20,7 @@ _CARD_YELLOW = "#ffd54a"
 _OUTLINE_BLUE = "#3fa7ff"  # likewise; hypotheses are blue, as in the paper
 _DARK_EDGE = "#c8c8c8"  # edge of a square whose reading was dark
 _GROUND = "#2a1a12"  # of the legend, as dark as the map at its darkest: everything on the map shows on it
-_NOTHING = 1e-9  # of a utility
+_NOTHING = 1e-6  # of a utility: rounding
 
 
 def playing_field(
@@ -57,7 +57,8 @@ def playing_field(
         Corners of each card whose place and albedo are known, (4, 2).
     """
     ax = canvas.axes_or_new(ax, size_in=(8.2, 5.2))
-    top = max(float(np.nanmax(utility)), _NOTHING)
+    top = float(np.nanmax(utility))
+    top = top if top > _NOTHING else 1.0
     for earlier in (*ax.collections, *ax.lines, *ax.patches):  # of a frame before; its map and colour bar are kept
         earlier.remove()
     if ax.images:

@@ -30,13 +30,16 @@ from probewise.systems.forms.reference import (
     POSITIVE,
     UNSEEN,
     BlockForm,
+    Declared,
     Form,
     ReferenceFit,
+    flag,
     period_with_sd,
 )
 from probewise.systems.table import RunTable, covariate_of_column
 
 _N_VALUES = 9
+_IN_EACH_RUN = "in_each_run"  # name of the parameter that is 0 for the first variant of a drift, 1 for the other
 _ALL = 17  # digits of a number in double precision
 _ROWS_OF_WAVES = 250_000  # rows at which a law is solved for the trial frequencies of one form: a fifth of a second
 _N_BANDS = 64  # of equal prior probability
@@ -162,23 +165,52 @@ def _weighted_residuals(about: ReferenceFit) -> FloatArray:
 class Modulation:
     """Variation of a quantity over the rows: `at_rows(theta, table)`, (n_samples, n_points), is 0 at amplitude 0.
 
-    `declared` is what `ReferenceFit.form` takes of it: parameters, covariates, words and more.
+    `declared` is what `ReferenceFit.form` takes of it: parameters, covariates, words and more; `variant` the same of
+    another variant, if there is one.
     """
 
     at_rows: Callable[[FloatArray, RunTable], FloatArray]
     declared: dict[str, Any]
+    variant: dict[str, Any] | None = None
+
+
+def time_since_start_of_run(table: RunTable) -> FloatArray:
+    """Return the time since the first row of each row's run, (n_points,)."""
+    first = np.array([table.time_s[rows].min() for rows in table.rows_by_scan()])
+    return np.asarray(table.time_s - first[table.scan])
 
 
 def linear_drift_modulation(about: ReferenceFit, what: str, unit: str) -> Modulation:
-    """Return a linear drift a t, with recorded time t from its origin: 0, or the first time if far from 0."""
+    """Return a linear drift a t, with recorded time t from its origin: 0, or the first time if far from 0.
+
+    Of runs one after the other, another variant counts the time from the start of each run.
+    """
     table, per, origin = about.table, about.time_unit, origin_of_column(about.table.time_s)
+    since = time_since_start_of_run(table)
+    follow_each_other = float(np.ptp(table.time_s - since)) >= float(since.max()) > 0.0
+
+    def says(mean: FloatArray, sd: FloatArray) -> str:
+        anew = " in each run, from its start" if (mean[1:] > 0.5).any() else ""
+        return f"{what} drifts by {value_with_sd(mean[0], sd[0], unit)} per {per}{anew}"
+
+    def at_rows(theta: FloatArray, rows: RunTable) -> FloatArray:
+        along = rows.time_s - origin
+        if theta.shape[1] > 1:
+            along = np.where(theta[:, 1:] > 0.5, time_since_start_of_run(rows), along)
+        return np.asarray(theta[:, :1] * along)
+
+    variants = []
+    for in_each_run in (False, True) if follow_each_other else ():
+        value, of_flag = flag(in_each_run)
+        variants.append({"parameters": {_IN_EACH_RUN: (of_flag, "1")}, "entries": np.array([[[1.0, value]]])})
+    size: Declared = {"a": (AMPLITUDE, f"{unit or '1'}/{per}")}
     declared = {
-        "parameters": {"a": (AMPLITUDE, f"{unit or '1'}/{per}")},
         "covariates": ("time",),
-        "says": lambda mean, sd: f"{what} drifts by {value_with_sd(mean[0], sd[0], unit)} per {per}",
+        "says": says,
         "counted_from": origin_in_words(table.time, origin, per),
     }
-    return Modulation(lambda theta, rows: theta[:, :1] * (rows.time_s - origin), declared)
+    given = [declared | each | {"parameters": size | each["parameters"]} for each in variants]
+    return Modulation(at_rows, *(given or [declared | {"parameters": size}]))
 
 
 def column_proportional_modulation(about: ReferenceFit, what: str, unit: str, name: str) -> Modulation:
@@ -189,7 +221,7 @@ def column_proportional_modulation(about: ReferenceFit, what: str, unit: str, na
         "covariates": (covariate_of_column(name),),
         "says": lambda mean, sd: f"{what} changes by {value_with_sd(mean[0], sd[0], unit)} per {per} of {name}",
     }
-    return Modulation(lambda theta, rows: theta[:, :1] * np.nan_to_num(rows.covariates[name] - middle), declared)
+    return Modulation(lambda theta, rows: theta[:, :1] * (rows.covariates[name] - middle), declared)
 
 
 def change_point_step_modulation(about: ReferenceFit, what: str, unit: str, *, may_end: bool = False) -> Modulation:
@@ -295,15 +327,21 @@ def modulated_form(
     Several values have one scale in common, unless they are so many that a single one could not differ much more than
     the others within the bounds of a coordinate.
     """
-    declared = how.declared | {"covariates": how.declared["covariates"] + covariates}
-    for form in about.form(name, stage, act=act, guess=guess, **declared):
-        if not 1 < len(form.amplitudes) <= _MOST_OF_ONE_SCALE:
-            yield form
-            continue
+    forms = [
+        form
+        for given in (how.declared, how.variant)
+        if given is not None
+        for form in about.form(
+            name, stage, act=act, guess=guess, **given | {"covariates": given["covariates"] + covariates}
+        )
+    ]
+    if len(forms) == 1 and 1 < len(forms[0].amplitudes) <= _MOST_OF_ONE_SCALE:
         # All runs may differ about as much, or one of them alone by far more than the others.
-        names = form.prior.names
-        together = SharedScalePrior(names, cast(Any, form.marginals[names[0]]))
-        yield replace(form, parameters=together, alternatives=(form,))
+        names = forms[0].prior.names
+        together = SharedScalePrior(names, cast(Any, forms[0].marginals[names[0]]))
+        forms.insert(0, replace(forms[0], parameters=together))
+    if forms:
+        yield replace(forms[0], alternatives=tuple(forms[1:]))
 
 
 _KINDS = {"drift": "drifts", "step": "steps", "per_run": "differs"}

@@ -32,6 +32,7 @@ from probewise.systems.forms.modulations import (
     modulated_form,
     modulations_over_rows,
     sinusoid_modulation,
+    time_since_start_of_run,
 )
 from probewise.systems.forms.reference import (
     AMPLITUDE,
@@ -226,7 +227,7 @@ def _curve_form(about: ReferenceFit, name: str) -> Iterator[Form]:
         return
 
     def act(value: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:
-        z = np.nan_to_num((2 * rows.covariates[name] - low - high) / (high - low))
+        z = (2 * rows.covariates[name] - low - high) / (high - low)
         return np.asarray(value + theta @ z ** np.arange(1, n + 1)[:, None])
 
     def says(mean: FloatArray, sd: FloatArray) -> str:
@@ -265,7 +266,7 @@ def _friction_form(about: ReferenceFit, name: str) -> Iterator[Form]:
 
     @acting
     def act(value: FloatArray, rows: RunTable, a: FloatArray, width: FloatArray) -> FloatArray:
-        return value + a * np.tanh(np.nan_to_num(rows.covariates[name]) / np.maximum(width, 0.1 * _NONE * low))
+        return value + a * np.tanh(rows.covariates[name] / np.maximum(width, 0.1 * _NONE * low))
 
     def says(mean: FloatArray, sd: FloatArray) -> str:
         by = f"tanh({name} / width), width {value_with_sd(mean[1], sd[1])}" if mean[1] > _NONE * low else "its sign"
@@ -280,12 +281,6 @@ def _friction_form(about: ReferenceFit, name: str) -> Iterator[Form]:
             smooth = replace(sign, parameters={**sign.marginals, "width": LogUniform(low, high)}, entries=widths)
             sign = replace(sign, alternatives=(smooth,))
         yield sign
-
-
-def time_since_start_of_run(table: RunTable) -> FloatArray:
-    """Return the time since the first row of each row's run, (n_points,)."""
-    first = np.array([table.time_s[rows].min() for rows in table.rows_by_scan()])
-    return np.asarray(table.time_s - first[table.scan])
 
 
 def settling_time_prior(about: ReferenceFit) -> LogUniform:

@@ -1,13 +1,16 @@
-"""The main picture of each type of result, for `plot`, and its HTML in notebooks: its summary and that picture."""
+"""What a result shows of itself: its main picture, its HTML in notebooks; of a verb also its page and its files."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
 
 from probewise._arrays import FloatArray
+from probewise._kinds import checked_path, checked_whole
+from probewise._writing import Drawings, Output, checked_output_directory
 from probewise.calibration import Calibration, FittedSensor
 from probewise.diagnosis import Diagnosis, PlanAudit, SystemFit
 from probewise.errors import ParameterError
@@ -15,7 +18,7 @@ from probewise.experiment import Exploration
 from probewise.investigation import Investigation
 from probewise.nested.result import Samples
 from probewise.recordings import Prediction, Recording
-from probewise.report import audit, calibration, exploration, fit, investigation
+from probewise.report import audit, calibration, diagnosis, exploration, fit, investigation
 from probewise.report.covariates import ResidualNoise
 from probewise.report.diagnosis_figures import draw_first_figure
 from probewise.report.html import element, figure
@@ -63,10 +66,19 @@ _DRAWINGS: dict[type, tuple[Callable[[Any], Axes | AxesGrid], str]] = {
     Investigation: (investigation.draw_probabilities_by_round, "Probability of each explanation after each round."),
 }
 
+_OUTPUTS: dict[type, Callable[..., Output]] = {
+    Calibration: calibration.output_of,
+    Diagnosis: diagnosis.output_of,
+    SystemFit: fit.output_of,
+    PlanAudit: audit.output_of,
+    Investigation: investigation.output_of,
+    Exploration: exploration.output_of,
+}
+
 
 def drawing_of(value: object) -> Axes | AxesGrid:
     """Draw a result's main picture; return its axes. ParameterError if a result of this type has none."""
-    if (kind := _kind_with_picture(value)) is None:
+    if (kind := _kind_in(_DRAWINGS, value)) is None:
         raise ParameterError("result", value, f"one with a picture: {', '.join(k.__name__ for k in _DRAWINGS)}")
     drawn = _DRAWINGS[kind][0](value)
     with text_as_it_is(figure_of(drawn)):
@@ -76,11 +88,31 @@ def drawing_of(value: object) -> Axes | AxesGrid:
 def html_of(value: object) -> str:
     """Return a result as an HTML fragment: its summary, and its main picture if its type has one."""
     said = element("pre", str(value))
-    if (kind := _kind_with_picture(value)) is None:
+    if (kind := _kind_in(_DRAWINGS, value)) is None:
         return said
     draw, caption = _DRAWINGS[kind]
     return element("div", said, figure(png(draw(value), dpi=_DPI), caption))
 
 
-def _kind_with_picture(value: object) -> type | None:
-    return next((kind for kind in type(value).__mro__ if kind in _DRAWINGS), None)
+def page_of(value: object, *, seed: int | None) -> str:
+    """Return the page of a result, with its figures inside."""
+    made = _output_of(value, seed)
+    return made.page({name: draw() for name, draw in made.drawers.items()})
+
+
+def save(value: object, folder: str | Path, *, seed: int | None) -> Path:
+    """Write a result into a folder, made if missing, and return it; errors as of `probewise._display.Reported.save`."""
+    made, out = _output_of(value, seed), checked_path("folder", folder)
+    drawings = Drawings(checked_output_directory(out, main=made.main, option="folder"))
+    drawings.write_results(made)
+    drawings.raise_if_any_failed()
+    return out
+
+
+def _output_of(value: object, seed: int | None) -> Output:
+    make = next(_OUTPUTS[kind] for kind in type(value).__mro__ if kind in _OUTPUTS)
+    return make(value, seed=None if seed is None else checked_whole("seed", seed, least=0, most=None))
+
+
+def _kind_in(known: dict[type, Any], value: object) -> type | None:
+    return next((kind for kind in type(value).__mro__ if kind in known), None)

@@ -264,8 +264,9 @@ def require_measures(name: str, own: object) -> None:
 
 def _number(name: str, found: object, allowed: str = _A_READING, *, may_be_nan: bool = False) -> float:
     """Return a number, also one of NumPy, as a float; ParameterError unless it is finite, or NaN where that may be."""
-    number = found.item() if isinstance(found, np.generic | np.ndarray) and np.ndim(found) == 0 else found
-    number = math.nan if np.ma.is_masked(found) and np.ndim(found) == 0 else number
+    number = found
+    if isinstance(found, np.generic | np.ndarray) and np.ndim(found) == 0:
+        number = math.nan if np.ma.is_masked(found) else found.item()
     wrong = not isinstance(number, Real) or math.isinf(number)
     if wrong or not (may_be_nan or (math.isfinite(number) and not isinstance(number, bool))):  # type: ignore[arg-type]
         raise ParameterError(name, found, allowed)

@@ -35,7 +35,7 @@ from probewise.progress import Progress, silent
 from probewise.recordings.plan import Plan, Recording, masks_of_readings_at_ends
 from probewise.systems import ProgressWithCallCount, RunRecording, RunTable, Simulator, System, as_recording, table_for
 from probewise.systems.forms import ReferenceFit, sorting_column
-from probewise.systems.forms.readings import time_since_start_of_run
+from probewise.systems.forms.modulations import time_since_start_of_run
 from probewise.systems.forms.reference import note_on_row_order, rows_are_in_order
 from probewise.systems.integrate import Integrations
 from probewise.systems.system import STANDS_STILL, with_converged_step
@@ -319,7 +319,9 @@ def recording_from_table(simulator: Simulator, table: RunTable) -> RunRecording:
 def _without_copies_of_reading(simulator: Simulator, table: RunTable) -> RunTable:
     """Leave out, with a note, columns that are the reading in another unit, unless the simulator reads them."""
     readings, inputs = table.covariates.get(simulator.reading), simulator.inputs(table.covariates)
-    for name in sorted(inputs.keys() - {*simulator.controls}) if readings is not None else ():
+    if readings is None:
+        return table
+    for name in sorted(inputs.keys() - {*simulator.controls}):
         if says_what_readings_say(inputs[name], readings):
             less = replace(table, columns={k: v for k, v in table.columns.items() if k != name})
             with contextlib.suppress(ProbewiseError):

@@ -26,7 +26,7 @@ from probewise.systems.forms import (
     names_of_jumps_in_sorted_rows,
 )
 from probewise.systems.forms.formulas import formula_forms
-from probewise.systems.forms.readings import time_since_start_of_run
+from probewise.systems.forms.modulations import time_since_start_of_run
 from probewise.systems.forms.reference import TWICE
 from probewise.systems.table import append_tables, covariate_of_column, unused_name
 

@@ -30,7 +30,6 @@ from probewise.systems.forms.reference import (
     POSITIVE,
     UNSEEN,
     BlockForm,
-    Declared,
     Form,
     ReferenceFit,
     flag,
@@ -199,11 +198,11 @@ def linear_drift_modulation(about: ReferenceFit, what: str, unit: str) -> Modula
             along = np.where(theta[:, 1:] > 0.5, time_since_start_of_run(rows), along)
         return np.asarray(theta[:, :1] * along)
 
-    variants = []
+    variants = list[dict[str, Any]]()
     for in_each_run in (False, True) if follow_each_other else ():
         value, of_flag = flag(in_each_run)
         variants.append({"parameters": {_IN_EACH_RUN: (of_flag, "1")}, "entries": np.array([[[1.0, value]]])})
-    size: Declared = {"a": (AMPLITUDE, f"{unit or '1'}/{per}")}
+    size: dict[str, Any] = {"a": (AMPLITUDE, f"{unit or '1'}/{per}")}
     declared = {
         "covariates": ("time",),
         "says": says,

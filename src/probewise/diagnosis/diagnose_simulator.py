@@ -316,6 +316,19 @@ def recording_from_table(simulator: Simulator, table: RunTable) -> RunRecording:
     return _without_readings(whole, ~np.isin(np.arange(len(table)), chosen), note)
 
 
+def _note_on_gaps_without_runs(simulator: Simulator, table: RunTable) -> tuple[str, ...]:
+    """Return a note where the time of a law's table, without runs, has gaps longer than all the rest; else ()."""
+    if simulator.law is None or table.run is not None or not table.has_varying_time:
+        return ()
+    gaps = np.diff(table.time_s)
+    long = np.flatnonzero(gaps > _LONG_GAP * np.median(gaps))
+    if gaps[long].sum() <= 0.5 * gaps.sum():
+        return ()
+    at = table.first_line + int(long[0])
+    said = f"the time jumps by {gaps[long[0]]:.4g} {simulator.time_unit} after row {at}"
+    return (f"{said}; if separate runs begin at such jumps, a column that names them, and run = its name, say so",)
+
+
 def _without_copies_of_reading(simulator: Simulator, table: RunTable) -> RunTable:
     """Leave out, with a note, columns that are the reading in another unit, unless the simulator reads them."""
     readings, inputs = table.covariates.get(simulator.reading), simulator.inputs(table.covariates)
@@ -330,6 +343,7 @@ def _without_copies_of_reading(simulator: Simulator, table: RunTable) -> RunTabl
     return table
 
 
+_LONG_GAP = 20.0  # median gaps
 _MOST_WITHOUT_COLUMN = 0.1  # of the readings: the rest tells the noise nearly as well
 
 
@@ -525,7 +539,7 @@ def prepare_system(
     A law is integrated by a linearly implicit method if `stiff`, or where it needs one.
     """
     table = _without_copies_of_reading(simulator, table) if with_effects else table
-    said = (*table.notes, *notes, *note_on_row_order(simulator, table))
+    said = (*table.notes, *notes, *note_on_row_order(simulator, table), *_note_on_gaps_without_runs(simulator, table))
     recording = replace(recording_from_table(simulator, table), source=source or simulator.source, notes=said)
     system = System.of(simulator, table, stiff=stiff)
     if with_effects and len(table) < 2:  # nothing can change along it

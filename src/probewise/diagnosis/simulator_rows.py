@@ -72,7 +72,7 @@ def candidate_runs(table: RunTable, simulator: Simulator) -> list[Candidate]:
             if table.time is not None:
                 time = table.time_s[kept]
                 begin = time[0] if table.time_begins_anew else _next_start_time(table)
-                changed[table.time] = begin + slower * (time - time[0])
+                changed[table.time] = _without_rounding_errors(begin + slower * (time - time[0]))
             taken, like = table.take(kept), {called: table.like.get(name, name)}  # parameters per run as in that run
             made = replace(taken, columns={**taken.columns, **changed}, run=run, like=like, first_row=len(table))
             unit = _minutes_of_time_unit(made, simulator.time_unit)
@@ -114,6 +114,11 @@ def _variations_of_run(
                 values = np.where((values == low) | (values == high), values, rounded)
             text = said.format(low=f"{low:.4g}", high=f"{high:.4g}", middle=f"{middle:.4g}")
             yield f"{name} {kind}", f"take {of} with {name} {text}", {name: values}, 1.0
+
+
+def _without_rounding_errors(times: FloatArray) -> FloatArray:
+    """Return times to twelve digits, as a person would write them."""
+    return np.array([float(f"{time:.12g}") for time in times])
 
 
 def _next_start_time(table: RunTable) -> float:
@@ -343,6 +348,8 @@ class SimulatorApparatus(Apparatus):
             table = cast(RunTable, candidate.plan)
             if table.time is not None and not recorded.time_begins_anew and out:
                 later = float(out[-1].plan.time_s[-1]) + _next_start_time(recorded) - float(recorded.time_s.max())
-                table = table.with_columns({table.time: table.time_s - table.time_s[0] + later})
+                table = table.with_columns(
+                    {table.time: _without_rounding_errors(table.time_s - table.time_s[0] + later)}
+                )
             out.append(replace(candidate, plan=cast(Plan, table)))
         return self.plan_of_alternatives(out, after)

@@ -40,7 +40,9 @@ from probewise.diagnosis.search.hypotheses import (
     WeighedFit,
     effects_out_of_vocabulary,
     expected_log_bayes_factor,
+    explains_hardly_anything,
     hypothesis_probabilities,
+    require_converged_fit,
 )
 from probewise.diagnosis.sensors import (
     default_sensor,
@@ -783,6 +785,9 @@ def search(
     state = SearchState(on_mean, prior, refits, always, progress, share_is_spent)
     if after is None:
         fit_nulls(state, prepared, max_order=max_order)
+        null = state.null
+        if prepared.null is not None and not prepared.has_too_little_data and explains_hardly_anything(null.found):
+            require_converged_fit(null.found, Linearised.of(null.found, null.law))  # before minutes of search
         misfit_templates = _build_misfit_templates(state, prepared)
     else:
         state.candidates |= {key: fit for key, fit in after.evidences.fits.items() if not fit.names}

@@ -324,6 +324,12 @@ class NoiseModels:
 
 
 _FAR = 10.0  # nats; a fit stops when a step gains less than 0.005
+_HARDLY = 0.9  # of the sd of the readings
+
+
+def explains_hardly_anything(found: Fit) -> bool:
+    """Return whether a fit's residuals are about as large as the readings vary."""
+    return float(found.residuals.std()) > _HARDLY * float((found.predicted + found.residuals).std())
 
 
 def require_converged_fit(found: Fit, problem: Linearised) -> None:
@@ -335,11 +341,13 @@ def require_converged_fit(found: Fit, problem: Linearised) -> None:
     slopes = problem.whiten(found.slopes)
     left = 0.5 * float(np.sum((slopes @ shift) ** 2) + shift @ shift)
     if left > _FAR and np.abs(found.z).max() < FARTHEST - 0.1:
-        raise NotConvergedError(
-            f"the fit of the model did not converge: one more step would still gain about {left:.0f} nats; "
-            "a narrower prior or more informative readings would help",
-            found,
-        )
+        cure = f"one more step would still gain about {left:.0f} nats; a narrower prior or more readings would help"
+        if explains_hardly_anything(found):
+            read, said = found.predicted + found.residuals, found.predicted
+            cure = f"it explains hardly anything: the readings go from {read.min():.3g} to {read.max():.3g}, its "
+            cure += f"predictions from {said.min():.3g} to {said.max():.3g}; are both in one unit, such as degrees or "
+            cure += "radians (observe converts), and are runs named and parameters of each run declared?"
+        raise NotConvergedError(f"the fit of the model did not converge: {cure}", found)
 
 
 Extended: TypeAlias = tuple[WeighedFit, dict[Names, float]]

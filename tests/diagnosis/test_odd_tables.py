@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from probewise.diagnosis import diagnose_system, fit_simulator
 from probewise.diagnosis.diagnose_simulator import prepare_system, recording_from_table
-from probewise.errors import ParameterError
+from probewise.diagnosis.search.hypotheses import require_converged_fit
+from probewise.errors import NotConvergedError, ParameterError
 from probewise.systems import Law, Simulator, table_for
 
 _N = 40
@@ -114,6 +116,25 @@ def test_a_drift_of_runs_that_follow_each_other_may_begin_again_in_each(gap, n_v
     assert ("in each run" in drift.sentence(last[0], 0.1 * last[0])) == (n_variants == 2)
 
 
+@pytest.mark.parametrize(("gap", "n_notes"), [(0.0, 0), (500.0, 1)])
+def test_a_time_that_jumps_where_no_run_is_named_is_noted(gap, n_notes):
+    """Of a law, which goes on through the gap; readings after it were called lost."""
+    law = Simulator("y", "V", {"a": (-3, 3)}, law=Law({"s": "a"}, lambda s, p, u: {"s": -0.1 * s["s"]}), time="t")
+    table = table_for(law, {"t": _T + gap * (_T >= 10.0), "y": np.exp(-0.1 * _T) + 0.01 * np.cos(7 * _T)})
+    notes = prepare_system(law, table).recording.notes
+    assert sum("jumps by 500.5 s after row 21" in note for note in notes) == n_notes
+    assert sum("jumps by" in note for note in notes) == n_notes
+
+
+def test_a_fit_that_explains_nothing_asks_for_units_and_runs():
+    found = SimpleNamespace(
+        z=np.zeros(1), predicted=np.sin(_X), residuals=60.0 * np.cos(9 * _X), slopes=np.ones((_N, 1))
+    )
+    problem = SimpleNamespace(absorbing_shift=lambda *_: np.ones(1), whiten=lambda slopes: slopes)
+    with pytest.raises(NotConvergedError, match=r"did not converge: it explains hardly anything: the readings go from"):
+        require_converged_fit(found, problem)
+
+
 def test_where_all_times_are_equal_rows_count():
     simulator, table = _TABLES["all times equal"]
     about = prepare_system(simulator, table_for(simulator, table)).apparatus
@@ -130,13 +151,15 @@ _SAME = "column same left out: it is the reading in another unit, and cannot be 
         (np.round(32 + 1.8 * _Y, 2), {}, True),
         (_Y + 0.01 * np.cos(50 * _X), {}, False),  # of another sensor
         (np.round(_Y), {}, False),  # too coarse to tell
+        (np.arange(_N), {"reading_of": 1.0 + 0.3 * np.arange(_N) + 0.01 * _Y}, False),  # a dial, with little noise
         (1000 * _Y, {"controls": ["same"]}, False),
         (1000 * _Y, {"simulate": lambda p, u: p["a"] + p["b"] * u["same"]}, False),
     ],
 )
 def test_a_column_that_is_the_reading_in_another_unit_explains_nothing(same, options, is_same):
-    simulator = replace(_line(), **options)
-    prepared = prepare_system(simulator, table_for(simulator, {"x": _X, "same": same, "y": _Y}))
+    readings = options.get("reading_of", _Y)
+    simulator = replace(_line(), **{k: v for k, v in options.items() if k != "reading_of"})
+    prepared = prepare_system(simulator, table_for(simulator, {"x": _X, "same": same, "y": readings}))
     assert (_SAME in prepared.recording.notes) == is_same
     assert ("curve:same" in prepared.effects) != is_same
 

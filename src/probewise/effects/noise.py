@@ -33,6 +33,7 @@ _SPREADS = (0.1, 0.2, 0.4, 0.8, 1.6)  # hyperprior, equal weights: sds between r
 _NEWTON_STEPS = 40
 _NEAR_END = 1e-4  # of the range of a lost reading's value: distance of the bank's values from its ends
 _TELLING = 15.0  # least ratio of a lattice's step to the rounding of the printed values
+_FINE = 1e-2  # of the range
 _FINEST = 1e-5  # of the range: the least step of a lattice that is looked for
 _ON_A_LINE = 5  # least distinct values of a column that is the readings in another unit
 _DIGITS = 1e-6  # of a step: below this a difference is rounding
@@ -365,17 +366,19 @@ SAYS_THE_SAME = "it is the reading in another unit, and cannot be what the readi
 def says_what_readings_say(values: FloatArray, readings: FloatArray) -> bool:
     """Return whether a column is the readings in another unit, (n_points,) both: on a line, but for printed digits.
 
-    Such a column holds the noise of the readings, too, so it cannot be what they depend on. Five of its values must
-    differ, as two lie on any line, and it must resolve a hundredth of their range.
+    Such a column holds the noise of the readings, too, so it cannot be what they depend on: its digits are finer than
+    the gaps between its values, which tells it from a dial in even steps on which they depend. Five of its values must
+    differ, and it must resolve a hundredth of their range.
     """
     there = np.isfinite(values) & np.isfinite(readings)
     x, y = values[there], readings[there]
-    if len(np.unique(x)) < _ON_A_LINE or not varies(y):
+    distinct = np.unique(x)
+    if len(distinct) < _ON_A_LINE or not varies(y) or 2 * lattice_step(x) > np.median(np.diff(distinct)):
         return False
     x = (x - x.mean()) / np.ptp(x)
     slope = float(x @ (y - y.mean()) / (x @ x))
     off = float(np.abs(y - y.mean() - slope * x).max())
-    if off > 0.01 * np.ptp(y):
+    if off > _FINE * np.ptp(y):
         return False
     digits = lattice_step(y) + abs(slope) * lattice_step(x) + _FINEST * float(np.ptp(y))
     return off <= 0.75 * digits  # half a digit, and what the line is off

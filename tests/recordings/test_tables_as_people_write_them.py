@@ -118,7 +118,7 @@ def test_a_clock_that_passes_midnight_goes_on(tmp_path):
     path = put(tmp_path, "t,y\n23:59:57,1\n00:00:00,2\n00:00:03.5,3\n")
     read = read_run_table(path, time="t", run=None, time_unit="min")
     np.testing.assert_allclose(read.time_s, [0, 0.05, 6.5 / 60])
-    assert "t counted in min from 23:59:57, past midnight" in read.notes[0]
+    assert "column 't' counted in min from 23:59:57, past midnight" in read.notes[0]
 
 
 @pytest.mark.parametrize(("last", "noted"), [("2026-11-30", True), ("2026-11-28", False)])

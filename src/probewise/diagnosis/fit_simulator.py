@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any, cast
 
 import numpy as np
@@ -31,6 +32,7 @@ from probewise.diagnosis.simulator_rows import SimulatorApparatus
 from probewise.errors import DoubtfulResultWarning, NotConvergedError, ParameterError, require
 from probewise.nested import Weighted
 from probewise.nested.importance import repartitioned
+from probewise.nested.sampler import sampler_progress
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Recording
 from probewise.systems import FittedSystem, RunTable, Simulator, System, table_for
@@ -279,12 +281,7 @@ def _nested_sampling(
     if problem.model.sensor.predicts_dearly:
         method, target = "nested sampling near the posterior", repartitioned(problem, z)
 
-    def report_round(state: nested.RoundSummary) -> None:
-        to_come = state.log_ratio_remaining
-        progress(
-            "nested sampling", note=f"{state.n_dead} points, ln Z {state.log_z:.1f}, at most {to_come:+.1f} to come"
-        )
-
+    report_round = partial(sampler_progress(progress), "nested sampling")
     n_live = max(_N_LIVE, nested.LIVE_PER_PARAM * z.shape[1])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DoubtfulResultWarning)  # the doubt is part of the result

@@ -207,7 +207,8 @@ class NestedResult(Samples):
         if self.check is not None:
             lines.append(
                 f"check        log Z {self.check.log_z:.2f} ± {self.check.log_z_error:.2f} by {self.check.route}, "
-                f"{self.check.distance:+.1f} errors from this run, {self.check.n_calls} evaluations"
+                f"this run {abs(self.check.distance):.1f} errors {'above' if self.check.distance > 0 else 'below'} it, "
+                f"{self.check.n_calls} evaluations"
             )
         if self.log_start < 0:
             share = math.exp(self.log_start)

@@ -52,6 +52,7 @@ from probewise.nested.problem import AnyPrior, Bound, Evaluator, OutOfCallsError
 from probewise.nested.result import NestedResult, as_json, software_versions
 from probewise.nested.save import CheckpointFile, LivePoints, RunState, settings_of_run
 from probewise.nested.weights import n_effective
+from probewise.progress import Progress
 
 LIVE_PER_PARAM = 2
 """Least number of live points per parameter."""
@@ -520,3 +521,14 @@ def _final_result(
         versions=software_versions(),
         warnings=tuple(note for note in doubts if note is not None),
     )
+
+
+def sampler_progress(progress: Progress) -> Callable[[int | str, RoundSummary], None]:
+    """Return a function (name of the run or number of Gaussians, summary) that reports the state of nested sampling."""
+
+    def tell(what: int | str, state: RoundSummary) -> None:
+        stage = what if isinstance(what, str) else f"{what} Gaussian{'s' if what > 1 else ''}"
+        to_come = math.exp(min(state.log_ratio_remaining, 100.0))
+        progress(stage, note=f"{state.n_dead} points, ln Z {state.log_z:.1f}, at most {to_come:.1g} times Z to come")
+
+    return tell

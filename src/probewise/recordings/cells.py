@@ -285,7 +285,7 @@ def _in_unit(name: str, seconds: FloatArray, first: str, unit: str) -> tuple[Flo
     if unit.lower() not in _SECONDS:
         raise UnclearCellError(0, f'numbers, or time_unit = "s", "ms", "min", "h" or "d" in place of "{unit}"')
     same = ", the time of all rows" if len(seconds) > 1 and not seconds.any() else ""
-    return seconds / _SECONDS[unit.lower()], f"{name} counted in {unit} from {first}{same}"
+    return seconds / _SECONDS[unit.lower()], f"column {name!r} counted in {unit} from {first}{same}"
 
 
 def _seconds_of_clocks(parts: Sequence[dict[str, Any]]) -> tuple[FloatArray, str]:

@@ -464,6 +464,8 @@ def require_plan(plan: object) -> None:
 def require_recording(recording: object) -> None:
     """Raise ParameterError unless `recording` is a Recording; the message says how to make one."""
     allowed = "a Recording: read_recording('NAME.csv') or Recording.from_table(table, ...), of probewise.recordings"
+    if isinstance(recording, Mapping) or hasattr(recording, "columns"):
+        allowed += "; a table of your own needs simulator= too"
     if callable(getattr(recording, "recording", None)) and not isinstance(recording, type):
         allowed = f"a Recording: take its .recording(), this is the {type(recording).__name__}"
     require_kind("recording", recording, Recording, allowed)

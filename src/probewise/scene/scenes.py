@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Protocol
@@ -81,14 +81,20 @@ class HypothesisScene:
         return OneRegionForAllNames(self.shape.region(theta))
 
 
-class OneRegionForAllNames(dict[str, Region]):
-    """A mapping from every name to one region; as its only key it lists "hypothesis"."""
+@dataclass(frozen=True, eq=False)
+class OneRegionForAllNames(Mapping[str, Region]):
+    """A mapping from every name to one `region`; as its only key it lists "hypothesis"."""
 
-    def __init__(self, region: Region) -> None:
-        super().__init__(hypothesis=region)
+    region: Region
 
-    def __missing__(self, name: str) -> Region:
-        return self["hypothesis"]
+    def __getitem__(self, name: str) -> Region:
+        return self.region
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(("hypothesis",))
+
+    def __len__(self) -> int:
+        return 1
 
 
 @dataclass(frozen=True)

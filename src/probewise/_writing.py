@@ -2,8 +2,8 @@
 
 The results of a command are written into a hidden folder inside `--out`, with a list of their names and digests. When
 all are complete, that folder is renamed; only then are they moved. A process killed before that has changed nothing;
-after that, the next command with the same `--out` moves the remaining files first. What stands in `--out` unchanged
-since the list there was written is an earlier result and is replaced or removed; any other file is a person's.
+after that, the next command with the same `--out` moves the remaining files first. What stands in `--out` as the list
+of the same kind of results there has it is an earlier result and is replaced or removed; any other file is a person's.
 """
 
 from __future__ import annotations
@@ -326,13 +326,13 @@ def _require_place(out: Path, name: str) -> None:
         raise FileError(folder, "a file of that name is in the way", "another folder, or none there")
 
 
-def _listed(file: Path) -> dict[str, object]:
+def _listed(file: Path) -> dict[str, str]:
     """Read a list of files that were written into a folder; it is empty if there is none, or it is damaged."""
     import json  # here, as help needs none
 
     with contextlib.suppress(OSError, ValueError, AttributeError, RecursionError):
         listed = json.loads(file.read_bytes() if file.is_file() and not file.is_symlink() else b"{}").items()
-        return {name: digest for name, digest in listed if digest}
+        return {name: digest for name, digest in listed if digest and isinstance(digest, str)}
     return {}
 
 

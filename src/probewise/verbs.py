@@ -174,7 +174,6 @@ def predict(
         If the plan's unit is not that of the calibration, or a column that an effect reads is missing.
     """
     from probewise import calibration, diagnosis, systems
-    from probewise._kinds import require_rng
     from probewise._progress import progress_or_bar
 
     if isinstance(model, diagnosis.Diagnosis):
@@ -182,7 +181,6 @@ def predict(
     fitted = model.fitted if isinstance(model, diagnosis.SystemFit) else model
     if not isinstance(fitted, systems.FittedSystem):
         return calibration.predict(fitted, cast("Plan | Recording", plan))
-    require_rng(rng)
     with progress_or_bar(progress) as told:
         return systems.predict_system(fitted, cast("Table", plan), rng=cast("np.random.Generator", rng), progress=told)
 

@@ -221,7 +221,7 @@ def test_a_stop_while_the_sensor_rises_keeps_the_reading_and_asks_for_nothing(
     """The motors are released before the reading is written."""
     at_rest = []
     spy = then(write_recording, lambda: at_rest.append(bricks["opened"][-1].at_rest))
-    monkeypatch.setattr("probewise.cli._record.write_recording", spy)
+    monkeypatch.setattr("probewise.cli.arm.write_recording", spy)
     stop_as_it_rises(n_read)
     out = tmp_path / "rec.csv"
     arguments = ["arm", "record", plan_file, "--out", out, "--arm", "nxt:x", "--quiet"]

@@ -99,7 +99,7 @@ JOURNALS = ("journal.jsonl", "trials.jsonl", "concealed.jsonl", "cases.jsonl", "
 @pytest.mark.parametrize(
     "command",
     [
-        pytest.param(words, marks=[] if words.startswith(QUICK[:1]) or "--live" in words else pytest.mark.slow)
+        pytest.param(words, marks=[] if words.startswith(QUICK[0]) or words.endswith("--live") else pytest.mark.slow)
         for words in (*COMMANDS, "diagnose data.csv --simulator heater.py --each", "explore --max-readings 1")
     ],
 )

@@ -11,8 +11,7 @@ from probewise.arm import DryRun, LegoArm, read_geometry, shipped_geometry_path
 from probewise.arm.geometry import Accuracy
 from probewise.cli import main
 from probewise.cli._bench import warn_if_place_sd_large
-from probewise.cli._record import SheetCheck, uniform_shades_at_places
-from probewise.cli.arm import bring_to_mark, place_after_moves
+from probewise.cli.arm import SheetCheck, bring_to_mark, place_after_moves, uniform_shades_at_places
 from probewise.recordings import HalfPlane, Uniform, paper_plan, write_plan
 
 OFF = {"x_mm": 3, "y_mm": -3, "shoulder_forward_mm": 3, "shoulder_height_mm": -3, "upper_mm": 3, "lower_mm": -3}

@@ -243,7 +243,7 @@ def test_results_of_an_earlier_run_do_not_stand_beside_a_new_journal_when_it_is_
 
     monkeypatch.setattr(exploration, "robot_view_png", stopped_at_the_second)
     out = tmp_path / "out"
-    with staged_output(out) as stage:
+    with staged_output(out, "result.json") as stage:
         for name in ("result.json", "samples.csv", "report.html", "sensor.json"):
             stage.write(name, sensor_file.read_text())
     (out / "notes.txt").write_text("mine")

@@ -6,7 +6,6 @@ import argparse
 import contextlib
 import glob
 import itertools
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -118,12 +117,8 @@ def journal_recording_and_shape(path: Path, sensor: FittedSensor) -> tuple[recor
     with _key_errors_of(path, "options", "options as explore writes them"):
         options = journal.settings["options"]
         low, high = options["reading_range"]
-        step, low, high = (None if value is None else float(value) for value in (options["step"], low, high))
-    if not all(value is None or math.isfinite(value) for value in (step, low, high)) or (
-        step is not None and step <= 0
-    ):
-        raise FileError(path, f"unusable options: step {step}, range {low} to {high}", "finite, a step above 0", row=1)
-    recording = journal.recording(instrumentation=replace(sensor.instrumentation, step=step, min=low, max=high))
+        instrumentation = replace(sensor.instrumentation, step=options["step"], min=low, max=high)
+    recording = journal.recording(instrumentation=instrumentation)
     allowed = f"shapes as explore has them: {', '.join(SHAPES)}"
     with _key_errors_of(path, "settings", allowed):
         written, size = journal.settings["shape"], journal.settings["field"]

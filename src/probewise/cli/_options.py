@@ -365,7 +365,7 @@ def _diagnose(to: argparse.ArgumentParser) -> None:
         "where they differ by more than a nat plus its standard error, unless a run gives a warning"
     )
     add(to, "--thorough", about)
-    about = "each recording by itself, into a folder of its name; table.csv and report.html sort them; it resumes"
+    about = "each recording by itself, into its folder; table.csv and report.html sort them; run again, it resumes"
     add(to, "--each", about)
     _add_executor(to)
     add(to, "--out DIR")
@@ -380,7 +380,7 @@ def _investigate(to: argparse.ArgumentParser) -> None:
     add(to, "--geometry ARM.toml")
     add(to, "--out DIR")
     add(to, "--sensor S.json")
-    about = "effects concealed in the simulated world: nothing, or backlash:0.5, joined by + (default: one drawn)"
+    about = "effects concealed in the simulated world: nothing, or backlash:0.5+... (default: one is drawn)"
     add(to, "--truth NAME:V,V", about)
     about = "largest number of readings beyond the first plan (default 400)"
     add(to, "--readings N", about, type=_count, default=400)
@@ -407,7 +407,7 @@ def _challenge(to: argparse.ArgumentParser) -> None:
     add(to, "--cases N", about, type=_count, default=60)
     about = "recordings of twelve kinds of system, each with its simulator's file, instead of a light sensor's"
     add(to, "--systems", about)
-    about = "take the readings that the diagnosis advises until it is settled, in N rounds at most (default 1: none)"
+    about = "take the readings that the diagnosis advises until it is settled, N rounds at most (1, default: none)"
     add(to, "--rounds N", about, type=_count, default=1)
     _add_executor(to)
     _add_seed_and_quiet(to)

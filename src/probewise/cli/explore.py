@@ -11,7 +11,6 @@ from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,7 @@ from probewise._arrays import FloatArray
 from probewise._signals import reporting_what_is_kept
 from probewise._writing import Drawings, checked_output_directory
 from probewise.arm import Geometry, Instrument, OwnInstrument, Reading
-from probewise.calibration import FittedSensor, read_sensor, write_sensor
+from probewise.calibration import FittedSensor, read_sensor
 from probewise.cli import _bench
 from probewise.cli._common import finish, message_to_resume, progress_of, say
 from probewise.cli._inputs import read_or_shipped_geometry, tables_and_descriptions
@@ -55,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.sensor is None:
         arguments.sensor = out / _SHIPPED
         if search.shipped:
-            search.write(_SHIPPED, search.shipped)
+            search.write(_SHIPPED, search.shipped.encode())
     _bench.confirm_lowering(search.arm, instrument, search.geometry)
     if search.as_built is not None:
         _bench.warn_if_place_sd_large(search.as_built, search.experiment.stop_sd_mm)
@@ -121,7 +120,7 @@ class Search:
         self.steps: list[Step] = []
         self.shadows: list[Step] = []
         self.frames: list[bytes] = []
-        self.shipped = b""  # content of the file of a sensor that is calibrated here
+        self.shipped = ""  # content of the file of a sensor that is calibrated here
         self.truth_mm: FloatArray | None = None
         self.known: Mapping[str, float] | None = None
         with_geometry = self.arm.is_lego or (arguments.geometry is not None and self.arm.kind != "file")
@@ -175,12 +174,10 @@ class Search:
             return read_sensor(arguments.out / _SHIPPED)
         say(arguments, "no --sensor: that of the recording that ships is calibrated")
         rng = np.random.default_rng(DEFAULT_SEED)
-        made = calibrate(read_recording(shipped("paper")), orders=(1,), rng=rng, progress=False).sensor
-        with TemporaryDirectory() as folder:
-            path = Path(folder) / _SHIPPED
-            write_sensor(made, path)
-            self.shipped = path.read_bytes()
-            return read_sensor(path)  # as a resumed run does: reading normalises the field once more, in its last digit
+        made = calibrate(read_recording(shipped("paper")), orders=(1,), rng=rng, progress=False)
+        self.shipped = made.sensor.to_json()
+        # As a resumed run reads it: the field is normalised once more, in its last digit.
+        return FittedSensor.from_json(self.shipped)
 
     def _naive_levels(self) -> Naive | None:
         """Return the paper's naive model's readings over black and white, with sds; None if it is not used."""
@@ -343,7 +340,9 @@ def parse_cards(texts: Sequence[str], field: Field) -> tuple[Card, ...]:
     return tuple(cards)
 
 
-def parse_truth(text: str | None, names: Sequence[str], field: Field, *, rng: np.random.Generator) -> HiddenShape:
+def parse_truth(
+    text: str | None, names: Sequence[str], field: Field, *, rng: np.random.Generator, option: str = "--truth"
+) -> HiddenShape:
     """Parse the true shape from "[SHAPE:]V,V,...", without SHAPE the first of `names`; None: draw it from the prior."""
     if text is None:
         return HiddenShape.drawn_from_prior({name: SHAPES[name](field) for name in names}, rng=rng)
@@ -351,11 +350,11 @@ def parse_truth(text: str | None, names: Sequence[str], field: Field, *, rng: np
     name = name or names[0]
     if name not in SHAPES:
         allowed = f"a shape of {', '.join(SHAPES)} before the colon{did_you_mean(name, SHAPES)}"
-        raise ParameterError("--truth", text, allowed)
+        raise ParameterError(option, text, allowed)
     shape, theta = SHAPES[name](field), np.array(parse_numbers(listed))
     wanted = shape.prior.names
-    require(len(theta) == len(wanted), "--truth", text, f"{len(wanted)} numbers, {','.join(wanted)}")
-    return HiddenShape.from_parameters(name, shape, theta, called=f"--truth {text}")
+    require(len(theta) == len(wanted), option, text, f"{len(wanted)} numbers, {','.join(wanted)}")
+    return HiddenShape.from_parameters(name, shape, theta, called=f"{option} {text}")
 
 
 def _path_relative_to_folder(folder: Path, path: Path) -> str:

@@ -74,10 +74,7 @@ def _target_outline_mm(text: str, field_mm: tuple[float, float]) -> FloatArray:
     """Return the outline of --target, (n, 2); ParameterError if it is no shape, or is not wholly on the field."""
     from probewise.cli.explore import parse_truth
 
-    try:
-        hidden = parse_truth(text, ("circle",), Field(*field_mm), rng=np.random.default_rng(0))
-    except ParameterError as error:
-        raise ParameterError(error.name.replace("--truth", "--target"), error.value, error.allowed) from error
+    hidden = parse_truth(text, ("circle",), Field(*field_mm), rng=np.random.default_rng(0), option="--target")
     outline = outlines(hidden.shape.region(hidden.theta[None, :]), n_vertices=720)[0]
     if (outline < 0).any() or (outline > field_mm).any():
         raise ParameterError("--target", text, f"a shape that lies on the field, {field_mm[0]:g} x {field_mm[1]:g} mm")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Protocol
@@ -124,17 +125,13 @@ def checked_covariates(columns: Mapping[str, ArrayLike] | None, n_points: int) -
 
 def selected_row_numbers(rows: ArrayLike | slice, n_points: int) -> IntArray:
     """Convert a selection of rows (numbers, a truth value per row, or a slice) to row numbers, (n_rows,)."""
+    with contextlib.suppress(IndexError):
+        at = rows if isinstance(rows, slice) else np.asarray(rows) if np.size(rows) else slice(0)
+        numbers = np.arange(n_points)[at]
+        if numbers.ndim == 1:
+            return numbers
     allowed = f"numbers of rows in a list, up to {n_points - 1}; {n_points} truth values; or a slice"
-    if isinstance(rows, slice):
-        return np.arange(n_points)[rows]
-    asked = np.asarray(rows)
-    if asked.size == 0:
-        return np.zeros(0, dtype=np.int64)
-    if asked.dtype == np.bool_ and asked.shape == (n_points,):
-        return np.flatnonzero(asked)
-    if asked.dtype.kind not in "iu" or asked.ndim != 1 or not ((asked >= -n_points) & (asked < n_points)).all():
-        raise ParameterError("rows", rows, allowed)
-    return np.asarray(asked, dtype=np.int64)
+    raise ParameterError("rows", rows, allowed)
 
 
 def numeric_covariates_and_notes(

@@ -144,7 +144,7 @@ def test_where_the_play_lies_is_unknown_after_hands_have_moved_the_joints(bench,
         arm.measure(bench.pose(*PLACES[0]))
         arm.release()
         getattr(arm, let_go)()
-        counts = arm._machine.limits.last_counts
+        counts = arm.machine.limits.last_counts
         joints = arm.geometry.joints
         expected = [joint.angle_at(counts[k], 0) for k, joint in enumerate(joints)]
         np.testing.assert_array_equal(arm.angles_rad, expected)
@@ -202,14 +202,14 @@ def test_a_reading_that_is_there_is_not_lost_when_the_line_dies_on_the_way_up(pa
 
     def run():
         with bench.arm as arm:
-            read = arm._machine.read_percent
+            read = arm.machine.read_percent
 
             def then_cut():
                 percent = read()
                 paper_brick.is_cut = True
                 return percent
 
-            arm._machine.read_percent = then_cut
+            arm.machine.read_percent = then_cut
             readings.append(arm.measure(bench.pose(*PLACES[0])))
             arm.measure(bench.pose(*PLACES[1]))
 

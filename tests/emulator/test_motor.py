@@ -5,7 +5,7 @@ import math
 import pytest
 
 from probewise.emulator import Brick, Motor
-from probewise.emulator.motors import OutputPort, OutputSetting, RunState
+from probewise.emulator.motors import IDLE, OutputPort, OutputSetting
 
 RUN, COAST, HOLD = "07 01 00 20", "00 00 00 00", "00 07 01 00 20 00 00 00 00"
 
@@ -71,7 +71,7 @@ def test_a_limited_run_overshoots_as_published_and_shows_idle_before_it_rests(as
     """360 asked for, 420 measured (plain limit, coasting)."""
     turn(ask, 75, 360)
     port = brick.outputs.ports[0]
-    while port.run_state != RunState.IDLE:
+    while port.run_state != IDLE:
         wait(clock, brick, 0.001)
     at_limit = port.tacho_count
     assert 360 <= at_limit <= 362

@@ -4,7 +4,6 @@ from probewise.arm.carry_out import RequestToPerson, carry_out, readings_of_reco
 from probewise.arm.geometry import Geometry, Joint, SoftLimits
 from probewise.arm.geometry_file import read_geometry, shipped_geometry_path
 from probewise.arm.instrument import (
-    FIELD_MM,
     Instrument,
     Pose,
     Reach,
@@ -14,16 +13,14 @@ from probewise.arm.instrument import (
 )
 from probewise.arm.lego import DryRun, LegoArm, percent_to_lego_units
 from probewise.arm.own import Measures, OwnInstrument, as_instrument
-from probewise.arm.simulated import Light, SimulatedArm, Speed, Workspace
+from probewise.arm.simulated import SimulatedArm, Speed, Workspace
 
 __all__ = [
-    "FIELD_MM",
     "DryRun",
     "Geometry",
     "Instrument",
     "Joint",
     "LegoArm",
-    "Light",
     "Measures",
     "OwnInstrument",
     "Pose",

@@ -68,8 +68,6 @@ def carry_out(
     places = np.stack([plan.x_mm, plan.y_mm], axis=-1) + np.asarray(origin_mm)
     require_within_reach(arm.reach, places, "row of the plan", way_out="; move the plan's origin")
     _require_feasible_settings(arm, plan)
-    if isinstance(arm, LegoArm):
-        arm.turned_rad = 0.0
     from_where = "where the geometry has it" if isinstance(arm, LegoArm) else "how it stands by itself"
     turns = _turns_by_hand_rad(arm, plan, places)
     if (turns[:first] > _SAME_TURN_RAD).any():
@@ -94,7 +92,7 @@ def carry_out(
             )
             ask(RequestToPerson(text, turned_rad=turned))
             arm.mounted_rad = turned
-        reading = _measure_row(arm, places[row], turned, plan, row)
+        reading = _measure_row(arm, places[row], plan, row)
         there, (x_mm, y_mm) = (float(plan.x_mm[row]), float(plan.y_mm[row])), origin_mm
         if (reading.pose.x_mm, reading.pose.y_mm) != (there[0] + x_mm, there[1] + y_mm):  # taken elsewhere: to a micron
             there = round(reading.pose.x_mm - x_mm, 3), round(reading.pose.y_mm - y_mm, 3)
@@ -124,20 +122,17 @@ def _turns_by_hand_rad(arm: LegoArm | OwnInstrument | SimulatedArm, plan: Plan, 
     """
     if arm.turns:
         return np.zeros(len(plan))
-    off = plan.orientation_rad - arm.orientation_rad(places_mm)
     if isinstance(arm, LegoArm):
+        off = plan.orientation_rad - arm.geometry.orientation_rad(places_mm)
         return np.asarray(np.rint(off / QUARTER_RAD) % 4 * QUARTER_RAD)
-    off = off % math.tau
+    off = (plan.orientation_rad - arm.orientation_rad(places_mm)) % math.tau
     return np.where(math.tau - off < _SAME_TURN_RAD, 0.0, off)
 
 
-def _measure_row(
-    arm: LegoArm | OwnInstrument | SimulatedArm, place_mm: FloatArray, turned_rad: float, plan: Plan, row: int
-) -> Reading:
+def _measure_row(arm: LegoArm | OwnInstrument | SimulatedArm, place_mm: FloatArray, plan: Plan, row: int) -> Reading:
     """Measure at a row's place, with its orientation and, if the arm can, its height, in the lab frame."""
     x_mm, y_mm = place_mm.tolist()
     if isinstance(arm, LegoArm):
-        arm.turned_rad = turned_rad
         return arm.measure(Pose(x_mm, y_mm, float(arm.orientation_rad(place_mm[None, :])[0])))
     height_mm = plan.covariates.get("height_mm", np.full(len(plan), np.nan))[row] if arm.lifts else math.nan
     up_mm = None if math.isnan(height_mm) else float(height_mm)

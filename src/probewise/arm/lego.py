@@ -52,10 +52,10 @@ class LegoArm:
     """An instrument: an arm of two links on a turning base, with its sensor looking straight down.
 
     `machine` moves it, entered and exited with the arm; `clock` gives the times of readings, from `start_s` of an
-    earlier run on. `turned_rad` is the angle by which the sensor has been turned by hand on its mount, relative to the
-    geometry; `mounted_rad` that to which a person was last asked to turn it, see `carry_out`, NaN: not known.
-    `first_down` is called with the height, in mm, after each step of the first lowering, and returns when a person has
-    confirmed that height; None: the first lowering is one move, like all later ones.
+    earlier run on. `mounted_rad` is the angle, relative to the geometry's, to which a person was last asked to turn the
+    sensor on its mount, see `carry_out`; NaN: not known, and taken for 0. `first_down` is called with the height, in
+    mm, after each step of the first lowering, and returns when a person has confirmed that height; None: the first
+    lowering is one move, like all later ones.
     """
 
     # A person turns the sensor, and it reads at one height.
@@ -64,19 +64,18 @@ class LegoArm:
     def __init__(
         self, machine: BrickMachine | DryRun, geometry: Geometry, *, clock: Clock = time, start_s: float = 0.0
     ) -> None:
-        self._machine, self.geometry, self._clock = machine, geometry, clock
+        self.machine, self.geometry, self._clock = machine, geometry, clock
         self.reach, self.read_height_mm = geometry, geometry.read_height_mm
         self._zero_s = clock.monotonic() - start_s
         self._is_down = False
         self._arrived: list[int] = [0, 0, 0]  # the direction from which each joint reached its position
-        self.turned_rad = 0.0
         self.mounted_rad = 0.0
         self.first_down: Callable[[float], None] | None = None
         self._stop: KeyboardInterrupt | None = None  # held back until a finished reading has been handed over
 
     def __enter__(self) -> Self:
         self._stop = None
-        self._machine.__enter__()
+        self.machine.__enter__()
         return self
 
     def __exit__(
@@ -89,14 +88,14 @@ class LegoArm:
             if error is None and self._is_down:
                 self.raise_sensor()
         except BaseException as failure:
-            self._machine.__exit__(type(failure), failure, failure.__traceback__)
+            self.machine.__exit__(type(failure), failure, failure.__traceback__)
             raise
-        self._machine.__exit__(kind, error, trace)
+        self.machine.__exit__(kind, error, trace)
 
     @property
     def angles_rad(self) -> FloatArray:
         """Joint angles by the motors' counters, shape (3,)."""
-        joints, counts = self.geometry.joints, self._machine.limits.last_counts
+        joints, counts = self.geometry.joints, self.machine.limits.last_counts
         return np.array([joints[k].angle_at(counts[k], self._arrived[k]) for k in (BASE, SHOULDER, ELBOW)])
 
     @property
@@ -106,7 +105,7 @@ class LegoArm:
 
     def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
         """Return the sensor's orientation at places, (n_places, 2), its turn by hand included: shape (n_places,)."""
-        return wrapped_to_pi(self.geometry.orientation_rad(places_mm) + self.turned_rad)
+        return wrapped_to_pi(self.geometry.orientation_rad(places_mm) + np.nan_to_num(self.mounted_rad))
 
     def reachable(self, places_mm: FloatArray) -> BoolArray:
         return self.geometry.contains(places_mm)
@@ -141,13 +140,15 @@ class LegoArm:
             allowed = f"{stands:.4f} at this place: this arm has no wrist, its sensor turns with the base"
             raise ReachError("orientation_rad", pose.orientation_rad, allowed)
         self.go_down(pose.x_mm, pose.y_mm)
-        battery_mv = self._machine.battery_mv()  # first, so that no failure loses the reading
+        battery_mv = self.machine.battery_mv()  # first, so that no failure loses the reading
         value = self.read_here()
         time_s = self._clock.monotonic() - self._zero_s
         covariates = {"height_mm": self.geometry.read_height_mm, "battery_mv": battery_mv}
         angles = self.angles_rad
         x_mm, y_mm, _ = self.geometry.position_mm(angles[None, :])[0].tolist()
-        turned_rad = wrapped_to_pi(self.geometry.mounting_rad + angles[BASE] - math.pi / 2 + self.turned_rad)
+        turned_rad = wrapped_to_pi(
+            self.geometry.mounting_rad + angles[BASE] - math.pi / 2 + np.nan_to_num(self.mounted_rad)
+        )
         reading = Reading(value, Pose(x_mm, y_mm, float(turned_rad)), time_s, covariates)
         self._raise_after_reading()
         return reading
@@ -223,7 +224,7 @@ class LegoArm:
         for joint in (ELBOW, SHOULDER, BASE):
             side = self.geometry.joints[joint].stop_side
             if side is not None:
-                self._machine.find_stop(joint, side)
+                self.machine.find_stop(joint, side)
                 self._arrived[joint] = side
                 stopped.append(joint)
         self.raise_sensor()
@@ -231,33 +232,25 @@ class LegoArm:
         goals = [JointTarget(0, side) for side in self._approach_sides_of(homes)]
         self._turn_all_to(goals)
         if stopped:
-            self._machine.reset(stopped)
+            self.machine.reset(stopped)
 
     def set_home(self) -> None:
         """Define the current position, set by hand, as home: set all counters to 0."""
-        self._machine.reset((BASE, SHOULDER, ELBOW))
+        self.machine.reset((BASE, SHOULDER, ELBOW))
         self._arrived = [0, 0, 0]
 
     def release(self) -> None:
         """Let all joints move freely."""
-        self._machine.release()
+        self.machine.release()
         self._arrived = [0, 0, 0]
 
     def read_here(self) -> float:
         """Read the sensor at its current place, in LEGO units, as in recordings."""
-        return percent_to_lego_units(self._machine.read_percent(), self.geometry)
-
-    def brightness(self) -> float:
-        """Read the sensor at its current place, in percent, 0 to 100, at its full resolution."""
-        return self._machine.read_percent()
-
-    def battery_mv(self) -> float:
-        """Read the battery's voltage, in mV."""
-        return self._machine.battery_mv()
+        return percent_to_lego_units(self.machine.read_percent(), self.geometry)
 
     def keep_awake(self) -> None:
         """Keep the brick from falling asleep; call it now and then during minutes of inactivity."""
-        self._machine.keep_awake()
+        self.machine.keep_awake()
 
     def turn_joint(self, joint: int, by_rad: float) -> None:
         """Turn one joint (0 to 2: base, shoulder, elbow) by a finite angle; ReachError if it would leave its limits."""
@@ -301,10 +294,10 @@ class LegoArm:
 
     def _heights_along_mm(self, way: Sequence[tuple[int, int]]) -> FloatArray:
         """Return the sensor's heights, (n,), along successive moves (joint, target count) from the current counts."""
-        counts = list(self._machine.limits.last_counts)
+        counts = list(self.machine.limits.last_counts)
         heights = []
         for joint, goal in way:
-            heights.append(self._machine.limits.heights_along_move_mm(counts, joint, goal))
+            heights.append(self.machine.limits.heights_along_move_mm(counts, joint, goal))
             counts[joint] = goal
         return np.concatenate(heights)
 
@@ -317,7 +310,7 @@ class LegoArm:
         high_enough = np.flatnonzero(self.geometry.position_mm(angles)[:, 2] >= self.geometry.travel_height_mm)
         if not high_enough.size:
             return None
-        here = self._machine.limits.last_counts[joint]
+        here = self.machine.limits.last_counts[joint]
         way = mechanics.counts_at(float(angles[high_enough[0], joint]), self._arrived[joint]) - here
         # A coarse move shorter than the motor's overrun would not be made.
         far = int(math.copysign(max(abs(way), ROOM_COUNTS), way))
@@ -332,11 +325,11 @@ class LegoArm:
 
     def _turn_joint_to(self, joint: int, goal: JointTarget) -> None:
         side: Side = 1 if (goal.side > 0) == (self.geometry.joints[joint].gear_ratio > 0) else -1
-        self._machine.move_to(joint, goal.counts, side)
+        self.machine.move_to(joint, goal.counts, side)
         self._arrived[joint] = goal.side
 
     def _move_joint_near(self, joint: int, counts: int) -> None:
-        self._machine.move_near(joint, counts)
+        self.machine.move_near(joint, counts)
         self._arrived[joint] = 0
 
 

@@ -202,7 +202,7 @@ def _print_position(arguments: argparse.Namespace, arm: LegoArm) -> None:
 
 def _print_light_and_battery(arguments: argparse.Namespace, geometry: Geometry) -> None:
     with _bench.open_lego_arm(arguments, geometry) as arm:
-        value, battery_mv = arm.read_here(), arm.battery_mv()
+        value, battery_mv = arm.read_here(), arm.machine.battery_mv()
         if not arguments.dry_run:
             print_result(f"{value:g} {_UNITS}, battery {battery_mv:.0f} mV")
 
@@ -249,7 +249,7 @@ def _compare_heights_by_light(arguments: argparse.Namespace, geometry: Geometry)
 
         def height_reading_at(place: tuple[float, float], height_mm: float) -> tuple[float, float, float]:
             arm.go_down(*place, height_mm)
-            values = np.array([arm.brightness() for _ in range(arguments.readings)])
+            values = np.array([arm.machine.read_percent() for _ in range(arguments.readings)])
             error = max(float(values.std()), _STEP_OF_LIGHT) / math.sqrt(arguments.readings)
             return float(arm.position_mm[2]), float(values.mean()), error
 

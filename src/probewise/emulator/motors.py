@@ -14,7 +14,6 @@ import math
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from enum import IntEnum
 
 from probewise.emulator.protocol import FieldValue, RefusedError, Status
 
@@ -66,11 +65,8 @@ _REGULATION_MS = 100
 _GAIN_P, _GAIN_I, _GAIN_D = 3, 1, 1
 
 
-class RunState(IntEnum):
-    """Run state of a port; ramps, which the firmware knows too, run at once at full power here."""
-
-    IDLE = 0x00
-    RUNNING = 0x20
+IDLE, RUNNING = 0x00, 0x20
+"""Run states of a port; ramps, which the firmware knows too, run at once at full power here."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +87,7 @@ class OutputPort:
 
     motor: Motor = field(default_factory=Motor)
     setting: OutputSetting = field(default_factory=OutputSetting)
-    run_state: RunState = RunState.IDLE
+    run_state: int = IDLE
     tacho_count: int = 0
     block_count: int = 0
     rotation_count: int = 0
@@ -118,7 +114,7 @@ class OutputPort:
         self.setting, self._settled = setting, False
         self._brake = bool(setting.mode & _BRAKE)
         on = bool(setting.mode & _ON)
-        self._change_run_state(RunState.RUNNING if on and setting.run_state else RunState.IDLE, setting.power * on)
+        self._change_run_state(RUNNING if on and setting.run_state else IDLE, setting.power * on)
         self._regulated = bool(on and setting.mode & _REGULATED and setting.regulation & _SPEED)
         if self._regulated and not self.set_power:
             self._error = self._error_sum = 0
@@ -142,9 +138,9 @@ class OutputPort:
         self.rotation_count += turned
         self._moved += turned
         self._clock_ms += 1
-        if self.run_state == RunState.RUNNING:
+        if self.run_state == RUNNING:
             self._stop_at_limit()
-        if self.run_state == RunState.IDLE:
+        if self.run_state == IDLE:
             self._fade_power()
         if self._clock_ms > _REGULATION_MS:
             self._regulate()
@@ -163,13 +159,13 @@ class OutputPort:
         # degree larger on average, and every place would be off accordingly.
         return math.floor(self.motor.angle_deg + 0.5)
 
-    def _change_run_state(self, run_state: RunState, power: int) -> None:
+    def _change_run_state(self, run_state: int, power: int) -> None:
         """Enter a run state with a power; a run that already has both goes on unchanged."""
-        if run_state == self.run_state != RunState.IDLE and power == self.set_power:
+        if run_state == self.run_state != IDLE and power == self.set_power:
             return
         if not self.target_power:
             self._error = self._error_sum = self._clock_ms = self._moved = 0
-        if run_state == RunState.RUNNING:
+        if run_state == RUNNING:
             self.set_power = self.target_power = power
             if not power:  # hold the present position
                 self.power = self._clock_ms = self._moved = 0
@@ -181,7 +177,7 @@ class OutputPort:
             if self.target_power:
                 self._goal = self.tacho_count
         elif self.set_power and (self.tacho_count - self._goal) * self.set_power >= 0:
-            self.run_state, self._regulated = RunState.IDLE, False
+            self.run_state, self._regulated = IDLE, False
         if not self._regulated:
             self.power = clipped(self.target_power, 100)
 
@@ -198,9 +194,9 @@ class OutputPort:
             before = (self.power, self._error, self._error_sum)
             error = self._error - self._moved + self.target_power
             steepness, self._error = error - self._error, error
-            self._error_sum = clipped(quotient_towards_zero(3 * self._error_sum + error, 4), 800)
+            self._error_sum = clipped(int((3 * self._error_sum + error) / 4), 800)  # towards 0, as C divides
             wanted = clipped(_GAIN_P * error, 100) + clipped(_GAIN_I * self._error_sum, 100) + _GAIN_D * steepness
-            self.power = clipped(quotient_towards_zero(wanted, 2), 100)
+            self.power = clipped(int(wanted / 2), 100)
             # A remaining error too small to overcome friction: the motor stays.
             self._settled = not self._moved and before == (self.power, self._error, self._error_sum)
         self._clock_ms = self._moved = 0
@@ -209,11 +205,6 @@ class OutputPort:
 def clipped(value: int, limit: int) -> int:
     """Clip a value to +-limit."""
     return min(max(value, -limit), limit)
-
-
-def quotient_towards_zero(value: int, by: int) -> int:
-    """Divide integers and round towards 0, as C does."""
-    return value // by if value >= 0 else -(-value // by)
 
 
 _ALL = 0xFF

@@ -18,17 +18,8 @@ from typing import Any, Literal, Self, TypeAlias
 
 import numpy as np
 
+from probewise.emulator import protocol
 from probewise.emulator.brick import Brick
-from probewise.emulator.protocol import (
-    COMMANDS,
-    Clock,
-    FrameAssembler,
-    Status,
-    VirtualClock,
-    build_reply,
-    framed,
-    parse_request,
-)
 from probewise.errors import FileError, LinkError, ParameterError, require
 
 
@@ -94,7 +85,12 @@ Trace: TypeAlias = Callable[[float, Event, str], None]
 _TURNAROUND_S = 0.060  # time of the radio to switch between receiving and sending
 _PIECE_S = 0.03
 _DOUBLED_S = 0.1
-_STATUSES = (Status.UNDEFINED_ERROR, Status.MALFORMED, Status.OUT_OF_RANGE, Status.NO_ROOM)
+_STATUSES = (
+    protocol.Status.UNDEFINED_ERROR,
+    protocol.Status.MALFORMED,
+    protocol.Status.OUT_OF_RANGE,
+    protocol.Status.NO_ROOM,
+)
 _UNASKED = bytes.fromhex("800900 03 686900")  # a running program writes "hi" to mailbox 0
 
 
@@ -111,7 +107,7 @@ class Radio:
     def __init__(
         self,
         brick: Brick,
-        clock: Clock,
+        clock: protocol.Clock,
         *,
         rng: np.random.Generator,
         faults: Faults | None = None,
@@ -126,7 +122,7 @@ class Radio:
 
     def reconnect(self) -> None:
         """Begin a new connection: bytes under way are lost, the brick's state is kept."""
-        self._frames = FrameAssembler()
+        self._frames = protocol.FrameAssembler()
         self._coming: deque[tuple[float, bytes]] = deque()
         self._held = b""  # a reply that waits for the next one
         self._last_s = 0.0
@@ -171,10 +167,10 @@ class Radio:
         self._trace_telegram("<", answer)
         at_s = self._clock() + self._turnaround_s
         if self._fault_occurs("unasked", self.faults.unasked):
-            self._schedule_delivery(at_s, framed(_UNASKED))
+            self._schedule_delivery(at_s, protocol.framed(_UNASKED))
         if self._fault_occurs("late", self.faults.late):
             at_s += self.faults.late_s
-        frame = self._with_faults(framed(answer))
+        frame = self._with_faults(protocol.framed(answer))
         if self._fault_occurs("merge", self.faults.merge):
             self._held += frame
             return
@@ -187,11 +183,11 @@ class Radio:
 
     def _random_refusal(self, telegram: bytes) -> bytes | None:
         """Return a reply with a random error status, in the brick's place; None if the request wants no reply."""
-        request = parse_request(telegram)
+        request = protocol.parse_request(telegram)
         if request is None or not request.wants_reply:
             return None
         zeros = 0 if request.command is None else request.command.error_bytes
-        return build_reply(request.opcode, int(self._rng.choice(_STATUSES)), bytes(zeros))
+        return protocol.build_reply(request.opcode, int(self._rng.choice(_STATUSES)), bytes(zeros))
 
     def _with_faults(self, frame: bytes) -> bytes:
         """Return a frame to the host with a byte changed, the end cut off or bytes dropped, as the rates have it."""
@@ -223,7 +219,7 @@ class Radio:
         return happens
 
     def _trace_telegram(self, event: Event, telegram: bytes) -> None:
-        command = COMMANDS.get(telegram[1]) if len(telegram) > 1 else None
+        command = protocol.COMMANDS.get(telegram[1]) if len(telegram) > 1 else None
         name = "unknown" if command is None else command.name
         self._trace(self._clock(), event, f"{telegram.hex(' ')}  {name}")
 
@@ -233,7 +229,7 @@ class VirtualLine:
 
     name = "the emulator"
 
-    def __init__(self, radio: Radio, clock: VirtualClock) -> None:
+    def __init__(self, radio: Radio, clock: protocol.VirtualClock) -> None:
         self._radio, self._clock = radio, clock
         self._received = bytearray()
         self._closed = False
@@ -333,7 +329,7 @@ class Terminal:
 def serve(
     terminal: Terminal,
     radio: Radio,
-    clock: Clock,
+    clock: protocol.Clock,
     *,
     on_move: Callable[[str], None],
     meanwhile: Callable[[], None],

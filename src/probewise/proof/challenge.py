@@ -24,25 +24,8 @@ from probewise.diagnosis.fit_simulator import calibrated_of, fitted_system_from_
 from probewise.effects import VOCABULARY, Extent
 from probewise.errors import DoubtfulResultWarning, NotConvergedError, ParameterError, ProbewiseError
 from probewise.investigation import investigate
+from probewise.proof import refits, sensors
 from probewise.proof.campaign import ROUNDS_CASE, SENSOR_CASE, SYSTEM_CASE, Campaign, Result, misfit_of_case
-from probewise.proof.refits import (
-    NullRefit,
-    SystemRefit,
-    cosines_with_vocabulary,
-    nats_of_alternative,
-    rivals_with_nats,
-)
-from probewise.proof.sensors import (
-    NO_PHYSICS,
-    Case,
-    CleanSetup,
-    CovariateRegion,
-    HiddenEffect,
-    Stratum,
-    draw_case,
-    held_out_recordings,
-    stratum_of,
-)
 from probewise.proof.systems.cases import SystemCase, draw_system_case, system_stratum_of, write_system_case
 from probewise.proof.systems.forms import SystemEffect
 from probewise.proof.tables import HONEST_NATS, NOISE, names_in_label
@@ -95,7 +78,7 @@ def sensor_truths_and_intervals(world: World, samples: ModelSamples) -> dict[str
     return {name: [float(true), *np.quantile(own, [0.025, 0.975]).tolist()] for name, (true, own) in pairs.items()}
 
 
-def place_overlap(region: CovariateRegion, places: Sequence[Place]) -> float:
+def place_overlap(region: sensors.CovariateRegion, places: Sequence[Place]) -> float:
     """Return intersection over union of an effect's region and the first of `places` in its covariate; 0 if none."""
     place = next((p for p in places if p.covariate == region.covariate), None)
     if place is None:
@@ -111,7 +94,7 @@ def place_overlap(region: CovariateRegion, places: Sequence[Place]) -> float:
 
 
 def log_densities_of_scans(
-    case: Case, diagnosis: Diagnosis, *, rng: np.random.Generator
+    case: sensors.Case, diagnosis: Diagnosis, *, rng: np.random.Generator
 ) -> dict[str, dict[str, float]]:
     """Return the log predictive density of each held-out scan, by its name, under up to three models, by name, in nats.
 
@@ -122,12 +105,12 @@ def log_densities_of_scans(
     fitting, *drawing = rng.spawn(4)
     models = {"null": diagnosis.null, "repaired": diagnosis.repaired}
     extent = Extent.of(case.recording)
-    names = [h.name for h in case.hidden if h.name not in NO_PHYSICS and h.name in VOCABULARY]
+    names = [h.name for h in case.hidden if h.name not in sensors.NO_PHYSICS and h.name in VOCABULARY]
     showing = [name for name in names if VOCABULARY[name].for_extent(extent) is not None]
     if showing and len(showing) == len(case.hidden):
         with suppress(ParameterError):  # under a model with dropouts, none of these readings was lost
             models["right"] = model_with(case.recording, showing, rng=fitting)
-    scans = held_out_recordings(case)
+    scans = sensors.held_out_recordings(case)
     scores: dict[str, dict[str, float]] = {}
     for (name, samples), child in zip(models.items(), drawing, strict=False):
         if name == "repaired" and samples is diagnosis.null:  # nothing is concealed: the right model is the null
@@ -170,12 +153,12 @@ def run_case(task: Task, rounds: int = 1) -> dict[str, Any]:
     """
 
     def parts() -> Iterator[dict[str, Any]]:
-        refit = NullRefit()
-        case = draw_case(task.seed, task.number, norm_after_refit=refit)
+        refit = refits.NullRefit()
+        case = sensors.draw_case(task.seed, task.number, norm_after_refit=refit)
         yield _truth_result(case, refit)
         yield _diagnosis_result(case, task) if rounds == 1 else _investigation_result(case, task, rounds)
 
-    return _result_or_failure(stratum_of(task.number)[0], parts())
+    return _result_or_failure(sensors.stratum_of(task.number)[0], parts())
 
 
 @own_arithmetic
@@ -183,7 +166,7 @@ def run_system_case(task: Task) -> dict[str, Any]:
     """Draw a case and diagnose it from its files alone; return a `results.SYSTEM_CASE`, or what failed."""
 
     def parts() -> Iterator[dict[str, Any]]:
-        refit = SystemRefit()
+        refit = refits.SystemRefit()
         case = draw_system_case(task.seed, task.number, after_refit=refit)
         yield _system_truth_result(case, refit)
         yield _system_diagnosis_result(case, task, refit)
@@ -191,7 +174,7 @@ def run_system_case(task: Task) -> dict[str, Any]:
     return _result_or_failure(system_stratum_of(task.number)[0], parts())
 
 
-def _result_or_failure(stratum: Stratum, parts: Iterator[dict[str, Any]]) -> dict[str, Any]:
+def _result_or_failure(stratum: sensors.Stratum, parts: Iterator[dict[str, Any]]) -> dict[str, Any]:
     """Return stratum, truth and diagnosis, the parts of a result, or where drawing or diagnosis fails, what failed."""
     result, at = asdict(stratum), "drawing"
     with warnings.catch_warnings():
@@ -206,7 +189,7 @@ def _result_or_failure(stratum: Stratum, parts: Iterator[dict[str, Any]]) -> dic
 
 
 def _hidden_result(
-    effect: HiddenEffect | SystemEffect, cosines: Mapping[str, float], on_noise: bool = False
+    effect: sensors.HiddenEffect | SystemEffect, cosines: Mapping[str, float], on_noise: bool = False
 ) -> dict[str, Any]:
     return {
         "name": effect.name,
@@ -218,14 +201,14 @@ def _hidden_result(
     }
 
 
-def _truth_result(case: Case, refit: NullRefit) -> dict[str, Any]:
-    setup = CleanSetup(case.recording.plan, replace(case.world, concealed=(), step=None), refit)
+def _truth_result(case: sensors.Case, refit: refits.NullRefit) -> dict[str, Any]:
+    setup = sensors.CleanSetup(case.recording.plan, replace(case.world, concealed=(), step=None), refit)
     hidden = []
     for one in case.hidden:
         # The world counts rounding apart from noise, but the diagnosis names it among the noise effects.
         on_noise = one.effect.disturbs or one.name == "quantisation"
         changed = None if on_noise else setup.recording_with_effects(one.effect)
-        like = {} if changed is None else cosines_with_vocabulary(refit, setup.clean_recording, changed)
+        like = {} if changed is None else refits.cosines_with_vocabulary(refit, setup.clean_recording, changed)
         hidden.append(_hidden_result(one, {name: rho for name, rho in like.items() if rho > _LEAST_COSINE}, on_noise))
     return {
         **{name: getattr(case, name) for name in ("plan", "ssf", "noise_level", "noise_model")},
@@ -237,7 +220,7 @@ def _truth_result(case: Case, refit: NullRefit) -> dict[str, Any]:
     }
 
 
-def _diagnosis_result(case: Case, task: Task) -> dict[str, Any]:
+def _diagnosis_result(case: sensors.Case, task: Task) -> dict[str, Any]:
     blind, later, files = task.generators(3)
     begun_s = time.process_time()
     diagnosis = diagnose(case.recording, rng=blind)
@@ -265,7 +248,7 @@ def _intervals_of_named(diagnosis: Diagnosis, truths: Mapping[str, Mapping[str, 
     return {name: effect_truths_and_intervals(true, named[name]) for name, true in truths.items() if name in named}
 
 
-def _investigation_result(case: Case, task: Task, rounds: int) -> dict[str, Any]:
+def _investigation_result(case: sensors.Case, task: Task, rounds: int) -> dict[str, Any]:
     thinking, reading = task.generators(2)
 
     def recording_of_round(number: int, plan: Plan, _: str) -> Recording:
@@ -309,23 +292,23 @@ _N_SAMPLES = 500
 
 
 def log_densities_of_runs(
-    case: SystemCase, diagnosis: Diagnosis, later: RunTable, refit: SystemRefit, *, rng: np.random.Generator
+    case: SystemCase, diagnosis: Diagnosis, later: RunTable, refit: refits.SystemRefit, *, rng: np.random.Generator
 ) -> dict[str, dict[str, float]]:
     """Return as `log_densities_of_scans` for the held-out runs "inside" the range of the recorded ones and "beyond" it.
 
     "right" knows the concealed effects: absent without effects or if the fit fails. What cannot be predicted is left
     out.
     """
-    fitting, *drawing = rng.spawn(4)
+    (fitting,), seed = rng.spawn(1), int(rng.integers(2**32))  # the same draws for all: their differences count
     models = {"null": (calibrated_of(diagnosis), later), "repaired": (repaired_of(diagnosis), later)}
     if case.effects:
         with suppress(NotConvergedError):  # no fit was possible, so the case does not count for the share
             models["right"] = _right_model_and_readings(case, later, refit, rng=fitting)
     drawn, scores = case.drawn, {"inside": dict[str, float](), "beyond": dict[str, float]()}
     run = drawn.table.run[drawn.held_out_row_numbers]
-    for (name, (model, table)), child in zip(models.items(), drawing, strict=False):
+    for name, (model, table) in models.items():
         with suppress(ParameterError):  # no reading can be predicted
-            density = predict_system(model, table, rng=child).log_density
+            density = predict_system(model, table, rng=np.random.default_rng(seed)).log_density
             for of_run, number in zip(scores.values(), np.unique(run), strict=True):
                 if np.isfinite(density[run == number]).all():
                     of_run[name] = float(density[run == number].sum())
@@ -333,7 +316,7 @@ def log_densities_of_runs(
 
 
 def _right_model_and_readings(
-    case: SystemCase, later: RunTable, refit: SystemRefit, *, rng: np.random.Generator
+    case: SystemCase, later: RunTable, refit: refits.SystemRefit, *, rng: np.random.Generator
 ) -> tuple[FittedSystem, RunTable]:
     """Return the model without effects, fitted beside the true ones, and held-out readings without their change.
 
@@ -360,10 +343,10 @@ def _right_model_and_readings(
 _LIKELY = 0.05
 
 
-def _system_truth_result(case: SystemCase, refit: SystemRefit) -> dict[str, Any]:
+def _system_truth_result(case: SystemCase, refit: refits.SystemRefit) -> dict[str, Any]:
     kind, hidden = case.drawn.kind, []
     for effect in case.effects:
-        rivals = rivals_with_nats(refit, case, effect)
+        rivals = refits.rivals_with_nats(refit, case, effect)
         # An alias's loss in nats is converted to a cosine.
         of_alias = {name: 1 - 2 * nats / effect.size_lambda**2 for name, nats in rivals.items() if nats < HONEST_NATS}
         like = {name: math.sqrt(max(squared, 0.0)) for name, squared in of_alias.items()}
@@ -384,7 +367,7 @@ def _system_truth_result(case: SystemCase, refit: SystemRefit) -> dict[str, Any]
     }
 
 
-def _system_diagnosis_result(case: SystemCase, task: Task, refit: SystemRefit) -> dict[str, Any]:
+def _system_diagnosis_result(case: SystemCase, task: Task, refit: refits.SystemRefit) -> dict[str, Any]:
     blind, later = task.generators(2)
     with tempfile.TemporaryDirectory() as directory:
         file, table, test = write_system_case(case, directory)
@@ -407,7 +390,7 @@ def _system_diagnosis_result(case: SystemCase, task: Task, refit: SystemRefit) -
     }
 
 
-def nats_of_alternatives(case: SystemCase, said: Mapping[str, Any], refit: SystemRefit) -> dict[str, float]:
+def nats_of_alternatives(case: SystemCase, said: Mapping[str, Any], refit: refits.SystemRefit) -> dict[str, float]:
     """Return how much worse what was said in other words explains a case, by its names joined with "+".
 
     Said are the hypotheses of more than 5 % and those of the credible set (`statements_to_score`), without effects on
@@ -419,5 +402,5 @@ def nats_of_alternatives(case: SystemCase, said: Mapping[str, Any], refit: Syste
     labels = {*likely, *map(names_in_label, said["credible_set"])}
     own = tuple(sorted(effect.name for effect in case.effects))
     others = {tuple(sorted(set(names) - NOISE - {"unknown"})) for names in labels} - {(), own}
-    nats = {"+".join(names): nats_of_alternative(refit, case, names) for names in sorted(others)}
+    nats = {"+".join(names): refits.nats_of_alternative(refit, case, names) for names in sorted(others)}
     return {label: loss for label, loss in nats.items() if math.isfinite(loss)}

@@ -23,30 +23,14 @@ from probewise.arm import Pose, Reading, SimulatedArm, Speed
 from probewise.experiment import CLEAN, TRUST, Experiment, Exploration, left_out_after_step, recording_of
 from probewise.experiment.result import WRONG_MM
 from probewise.inference import Rounded
+from probewise.proof import study
 from probewise.proof.campaign import CONCEALED_TRIAL, Campaign, Estimate, Result, estimated_share, grouped, misfit
-from probewise.proof.study import (
-    BLOB,
-    BRIGHT,
-    DARK,
-    FIELD,
-    MOST_CIRCLES,
-    REFERENCE,
-    SEED,
-    accuracy_measures,
-    arm_that_reads,
-    disc_of,
-    experiment_of,
-    footprint_pixels,
-    mixture_of,
-    timed_steps,
-    true_circle,
-)
 from probewise.recordings.table import csv_text_of_rows
 from probewise.sensor import Chain
 from probewise.world import Blob, Concealed, World
 from probewise.world import concealed as conceal
 
-_MIDDLE_MM = (FIELD.width_mm / 2, FIELD.height_mm / 2)
+_MIDDLE_MM = (study.FIELD.width_mm / 2, study.FIELD.height_mm / 2)
 _MOVE_S = 0.8  # of a reading: what a move takes, about
 _SECOND = Blob(0.4, (7.0, -1.0), (2.5, 4.0))  # of the sensor of two Gaussians
 
@@ -55,23 +39,23 @@ _SECOND = Blob(0.4, (7.0, -1.0), (2.5, 4.0))  # of the sensor of two Gaussians
 class Conditions:
     """Noise sd, seconds between readings, about, rounding step and footprint; those of the study's table by default."""
 
-    noise_sd: float = REFERENCE.noise_sd
+    noise_sd: float = study.REFERENCE.noise_sd
     each_s: float = 8.0
     step: float | None = None
-    blobs: tuple[Blob, ...] = (BLOB,)
+    blobs: tuple[Blob, ...] = (study.BLOB,)
 
     @classmethod
     def draw(cls, rng: np.random.Generator) -> Self:
         """Draw noise and pace log-uniformly, and whether readings are rounded and the sensor has two Gaussians."""
         noise_sd, each_s = (math.exp(rng.uniform(*np.log(ends))) for ends in ((0.3, 2.0), (2.0, 20.0)))
         rounded, two = rng.random(2) < 0.5
-        return cls(noise_sd, each_s, 1.0 if rounded else None, (BLOB, _SECOND) if two else (BLOB,))
+        return cls(noise_sd, each_s, 1.0 if rounded else None, (study.BLOB, _SECOND) if two else (study.BLOB,))
 
     def experiment(self) -> Experiment:
         """Return the reference experiment of a robot that knows these conditions."""
-        posed = experiment_of(replace(REFERENCE, noise_sd=self.noise_sd))
+        posed = study.experiment_of(replace(study.REFERENCE, noise_sd=self.noise_sd))
         if len(self.blobs) > 1:
-            posed = replace(posed, model=replace(cast(Chain, posed.model), ssf=mixture_of(self.blobs)))
+            posed = replace(posed, model=replace(cast(Chain, posed.model), ssf=study.mixture_of(self.blobs)))
         if self.step is not None:
             rounded = Rounded(self.noise_sd, self.step, -math.inf, math.inf)
             posed = replace(posed, likelihood=rounded, step=self.step)
@@ -96,7 +80,7 @@ def _step_at_any_moment(a: float, now: Conditions, rng: np.random.Generator) -> 
     return conceal.ambient_step(a, float(now.each_s * rng.uniform(1, 20)))
 
 
-_W = FIELD.width_mm
+_W = study.FIELD.width_mm
 _UNITS, _PLACES, _SHARES, _STEPS = (1.5, 4.0, 8.0), (1.5, 6.0, 12.0), (0.05, 0.2, 0.4), (2.0, 8.0, 16.0)
 _LEVELS, _LOST, _SCALES = (55.0, 40.0, 25.0), (0.03, 0.1, 0.2), _and_tenfold(0.005)
 
@@ -112,7 +96,7 @@ CONCEALED_BY_FORM: Mapping[str, Mapping[str, Row]] = {
         "gain_drift": (lambda a, now, rng: conceal.gain_drift(a, 15 * now.each_s), (0.05, 0.15, 0.3)),
         "edge_blur": (_of(conceal.edge_blur), (3.0, 11.0, 20.0)),
         "halo": (_of(conceal.halo, 25.0), _SHARES),
-        "dropouts": (_of(conceal.dropouts, DARK), _LOST),
+        "dropouts": (_of(conceal.dropouts, study.DARK), _LOST),
         "outliers": (_of(conceal.outliers, 12.0), _LOST),
         "gain_loss": (lambda a, now, rng: conceal.gain_loss(a, now.each_s), (0.001, 0.005, 0.01), "gain_drift"),
         "hysteresis": (_of(conceal.hysteresis), _and_tenfold(1.0)),
@@ -152,7 +136,10 @@ CONCEALED_BY_FORM: Mapping[str, Mapping[str, Row]] = {
     "in no list": {
         "bent_rail": (lambda a, now, rng: conceal.bent_rail(a * (10 / _W) ** 2), _and_tenfold(2.0)),
         "place_step": (_of(conceal.place_step, _MIDDLE_MM[0]), _and_tenfold(1.0)),
-        "after_glow": (lambda a, now, rng: conceal.after_glow(a, 3 * now.each_s, 0.5 * (DARK + BRIGHT)), _UNITS),
+        "after_glow": (
+            lambda a, now, rng: conceal.after_glow(a, 3 * now.each_s, 0.5 * (study.DARK + study.BRIGHT)),
+            _UNITS,
+        ),
         "peak_memory": (_of(conceal.peak_memory), _SHARES),
     },
     "two at once": {
@@ -190,13 +177,13 @@ class ConcealedTrial:
     circle: int
     trust: float
     max_readings: int = 100
-    seed: int = SEED
+    seed: int = study.SEED
     varied: bool = False
 
     @property
     def circle_mm(self) -> FloatArray:
         """The true circle: x_mm, y_mm, radius_mm, (3,)."""
-        return true_circle(REFERENCE.population, self.circle, seed=self.seed)
+        return study.true_circle(study.REFERENCE.population, self.circle, seed=self.seed)
 
     @property
     def true_circle_in_arm_frame(self) -> FloatArray:
@@ -228,13 +215,13 @@ def run_concealed_trial(trial: ConcealedTrial) -> dict[str, Any]:
     """Search for a circle with a sensor that has a concealed effect; return a `results.CONCEALED_TRIAL`."""
     experiment = replace(trial.conditions.experiment(), trust=trial.trust)
     run: Any = {"seed": trial.seed, "circle": trial.circle, "max_readings": trial.max_readings}
-    steps, cpu = zip(*timed_steps(_arm_in_concealed_world(trial), experiment, **run), strict=True)
+    steps, cpu = zip(*study.timed_steps(_arm_in_concealed_world(trial), experiment, **run), strict=True)
     last = steps[-1]
     left_out = left_out_after_step(last, trial.trust)
     return {
         "known": Exploration(experiment, (last,)).target_reached,
         "readings": last.number,
-        **accuracy_measures(last, experiment, trial.true_circle_in_arm_frame),
+        **study.accuracy_measures(last, experiment, trial.true_circle_in_arm_frame),
         "p_truth": round(sum(left_out.probability.get(name, 0.0) for name in trial.right_answers), 4),
         "credible": list(left_out.credible_set),
         "noticed": experiment.fit_is_doubtful(last.p_value) or left_out.leading != CLEAN,
@@ -250,8 +237,8 @@ def _arm_in_concealed_world(trial: ConcealedTrial) -> SimulatedArm:
         make, sizes, *_ = CONCEALED[trial.effect]
         made = make(sizes[trial.size], now, np.random.default_rng([trial.seed, trial.circle, trial.size, 2]))
     noisy: Any = {"noise_sd": now.noise_sd, "step": now.step, "concealed": made if isinstance(made, tuple) else (made,)}
-    world = World(footprint_pixels(now.blobs), black=DARK, white=BRIGHT, **noisy)
-    disc = disc_of(trial.circle_mm)
+    world = World(study.footprint_pixels(now.blobs), black=study.DARK, white=study.BRIGHT, **noisy)
+    disc = study.disc_of(trial.circle_mm)
     came: list[tuple[Pose, float, tuple[float, float]]] = []
 
     def light_reading(pose: Pose, time_s: float, height_mm: float) -> float:
@@ -265,7 +252,7 @@ def _arm_in_concealed_world(trial: ConcealedTrial) -> SimulatedArm:
         rng = np.random.default_rng([trial.seed, trial.circle, len(came) - 1])
         return world.read(disc, pose.x_mm, pose.y_mm, pose.orientation_rad, time_s=time_s, rng=rng, direction=direction)
 
-    return arm_that_reads(light_reading, speed=Speed(500.0, now.each_s - _MOVE_S))
+    return study.arm_that_reads(light_reading, speed=Speed(500.0, now.each_s - _MOVE_S))
 
 
 def concealed_study(
@@ -275,7 +262,7 @@ def concealed_study(
     effects: Sequence[str] = tuple(CONCEALED),
     sizes: Sequence[int] = (0, 1, 2),
     n_clean: int | None = None,
-    seed: int = SEED,
+    seed: int = study.SEED,
     varied: bool = False,
 ) -> Campaign[ConcealedTrial]:
     """Return the campaign of every row over the first circles, with trust `TRUST` and 1.
@@ -286,7 +273,7 @@ def concealed_study(
     conditions of its own.
     """
     for n in (n_circles, n_clean or n_circles):
-        checked_whole("n_circles", n, most=MOST_CIRCLES)
+        checked_whole("n_circles", n, most=study.MOST_CIRCLES)
     rows = {("", 0): n_clean or n_circles, **{(name, size): n_circles for name in effects for size in sizes}}
     trials = [
         ConcealedTrial(name, size, circle, trust, max_readings, seed, varied)

@@ -16,52 +16,19 @@ from probewise._arrays import FloatArray, IntArray
 from probewise._words import count_with_noun
 from probewise.diagnosis.words import effect_has_words, effect_in_words
 from probewise.experiment import least_readings
+from probewise.proof import study, tables
 from probewise.proof.campaign import LEAST_FOR_MEDIAN, Estimate, Result
 from probewise.proof.concealed_study import ConcealedRow, ConcealedTrial, concealed_csv, concealed_rows
-from probewise.proof.study import (
-    REFERENCE,
-    SearchConfiguration,
-    Summary,
-    Trial,
-    experiment_of,
-    summaries,
-    trials_by_row,
-)
-from probewise.proof.tables import (
-    NOISE,
-    Results,
-    ScoreRow,
-    are_names_right,
-    confusion_counts,
-    detected_and_named_by_effect,
-    gains_on_held_out_runs,
-    leading_hypothesis,
-    name_without_target,
-    reliability_bins,
-)
 from probewise.recordings.table import csv_text_of_rows
 from probewise.report.html import Draw, Markup, Section, definition_list, figure, fragment, page, paragraph, table
-from probewise.report.plots.canvas import (
-    BLACK,
-    BLUE,
-    GREY,
-    PAGE_IN,
-    SMALL_PT,
-    VERMILLION,
-    AxesGrid,
-    grid_of_axes,
-    label_axes,
-    legend_above,
-    legend_below,
-    png,
-)
+from probewise.report.plots import canvas
 from probewise.report.plots.search import set_up_width_axes
 from probewise.report.words import number_text, typeset_numbers, value_with_error
 
 _BAND = (0.16, 0.84)
 
 
-def posterior_widths_of_runs(runs: Mapping[str, Sequence[FloatArray]], *, target_mm: float = 4.0) -> AxesGrid:
+def posterior_widths_of_runs(runs: Mapping[str, Sequence[FloatArray]], *, target_mm: float = 4.0) -> canvas.AxesGrid:
     """Draw the widest posterior sd after each reading: median and middle 68 % of the runs, one panel per row.
 
     Thin lines are the medians of the other panels. A run that has ended keeps its last width.
@@ -70,22 +37,24 @@ def posterior_widths_of_runs(runs: Mapping[str, Sequence[FloatArray]], *, target
     """
     n_columns = min(len(runs), 2)
     n_rows = -(-len(runs) // max(n_columns, 1))
-    size_in = (PAGE_IN if n_columns == 2 else 6.8, 0.5 + 2.9 * n_rows)
-    axes = grid_of_axes(n_rows, n_columns, size_in=size_in, sharex=True, sharey=True)
-    longest = {name: max(len(w) for w in widths) for name, widths in runs.items()}
-    tables = {
-        name: np.array([np.pad(w, (0, longest[name] - len(w)), mode="edge") for w in widths])
-        for name, widths in runs.items()
+    size_in = (canvas.PAGE_IN if n_columns == 2 else 6.8, 0.5 + 2.9 * n_rows)
+    axes = canvas.grid_of_axes(n_rows, n_columns, size_in=size_in, sharex=True, sharey=True)
+    longest = {name: max(len(w) for w in of_row) for name, of_row in runs.items()}
+    widths = {
+        name: np.array([np.pad(w, (0, longest[name] - len(w)), mode="edge") for w in of_row])
+        for name, of_row in runs.items()
     }
-    number = {name: np.arange(1.0, own.shape[1] + 1) for name, own in tables.items()}
-    for ax, (name, own) in zip(axes.flat, tables.items(), strict=False):
-        for other, more in tables.items():
+    number = {name: np.arange(1.0, own.shape[1] + 1) for name, own in widths.items()}
+    for ax, (name, own) in zip(axes.flat, widths.items(), strict=False):
+        for other, more in widths.items():
             if other != name:
                 label = "median of another panel"
-                ax.plot(number[other], np.median(more, axis=0), color=GREY, linewidth=0.9, label=label)
+                ax.plot(number[other], np.median(more, axis=0), color=canvas.GREY, linewidth=0.9, label=label)
         low, high = np.quantile(own, _BAND, axis=0)
-        ax.fill_between(number[name], low, high, color=BLUE, alpha=0.2, linewidth=0, label="middle 68 % of the runs")
-        ax.plot(number[name], np.median(own, axis=0), color=BLUE, linewidth=1.8, label="median")
+        ax.fill_between(
+            number[name], low, high, color=canvas.BLUE, alpha=0.2, linewidth=0, label="middle 68 % of the runs"
+        )
+        ax.plot(number[name], np.median(own, axis=0), color=canvas.BLUE, linewidth=1.8, label="median")
         set_up_width_axes(ax, target_mm)
         ax.set_title(f"{name} ({count_with_noun(len(own), 'run')})", fontsize="medium", loc="left")
         ax.label_outer()
@@ -93,7 +62,7 @@ def posterior_widths_of_runs(runs: Mapping[str, Sequence[FloatArray]], *, target
         ax.set_visible(False)
         axes.flat[len(runs) - n_columns].xaxis.set_tick_params(labelbottom=True)
         axes.flat[len(runs) - n_columns].set_xlabel("number of readings")
-    legend_below(axes)
+    canvas.legend_below(axes)
     return axes
 
 
@@ -103,18 +72,18 @@ def _value_and_whiskers(estimates: Sequence[Estimate]) -> tuple[FloatArray, Floa
     return value, np.maximum([value - low, high - value], 0.0)
 
 
-def readings_needed(rows: Mapping[str, Summary]) -> AxesGrid:
+def readings_needed(rows: Mapping[str, study.Summary]) -> canvas.AxesGrid:
     """Draw mean and median readings needed in each row of a study, in all and after the first reading on white.
 
     `rows` are drawn from the top in this order. Returns axes, (1, 2).
     """
     names = ["\n".join(textwrap.wrap(name, 30)) for name in rows]
     n_lines = sum(1 + name.count("\n") for name in names)
-    axes = grid_of_axes(1, 2, size_in=(PAGE_IN, 1.5 + 0.2 * len(names) + 0.16 * n_lines), sharey=True)
+    axes = canvas.grid_of_axes(1, 2, size_in=(canvas.PAGE_IN, 1.5 + 0.2 * len(names) + 0.16 * n_lines), sharey=True)
     y = np.arange(len(names))
     for ax, parts, title in (
-        (axes[0, 0], (("mean", BLUE, "o", -0.14), ("median", VERMILLION, "s", 0.14)), "in all"),
-        (axes[0, 1], (("after_white", BLUE, "o", 0.0),), "after the first on white"),
+        (axes[0, 0], (("mean", canvas.BLUE, "o", -0.14), ("median", canvas.VERMILLION, "s", 0.14)), "in all"),
+        (axes[0, 1], (("after_white", canvas.BLUE, "o", 0.0),), "after the first on white"),
     ):
         for part, colour, marker, shift in parts:
             value, whiskers = _value_and_whiskers([getattr(summary, part) for summary in rows.values()])
@@ -123,42 +92,42 @@ def readings_needed(rows: Mapping[str, Summary]) -> AxesGrid:
             style = {"fmt": marker, "color": colour, "markersize": 5, "capsize": 3, "label": label}
             ax.errorbar(value, y + shift, xerr=whiskers, **style)
         ax.set_xlim(left=0)
-        ax.grid(axis="x", color=GREY, alpha=0.25)
+        ax.grid(axis="x", color=canvas.GREY, alpha=0.25)
         ax.set_yticks(y, names)
-        label_axes(ax, x="number of readings", y="", title=title)
+        canvas.label_axes(ax, x="number of readings", y="", title=title)
     # Half a row of margin at either end, also for a single row.
     axes[0, 0].set_ylim(len(names) - 0.5, -0.5)
-    legend_below(axes)
+    canvas.legend_below(axes)
     return axes
 
 
 def reliability_diagram(bins: Sequence[tuple[float, Estimate]]) -> Axes:
     """Draw the share of right diagnoses against the stated probability, with Wilson intervals and numbers of cases."""
-    ax = grid_of_axes(1, 1, size_in=(5.2, 5.0))[0, 0]
-    ax.plot([0, 1], [0, 1], color=GREY, linewidth=0.9, linestyle="--", label="honest")
+    ax = canvas.grid_of_axes(1, 1, size_in=(5.2, 5.0))[0, 0]
+    ax.plot([0, 1], [0, 1], color=canvas.GREY, linewidth=0.9, linestyle="--", label="honest")
     value, whiskers = _value_and_whiskers([right for _, right in bins])
     at = np.array([stated for stated, _ in bins])
-    ax.errorbar(at, value, yerr=whiskers, fmt="o", color=BLUE, markersize=5, capsize=3, label="found, 95 %")
+    ax.errorbar(at, value, yerr=whiskers, fmt="o", color=canvas.BLUE, markersize=5, capsize=3, label="found, 95 %")
     for stated, right in bins:
-        place = {"xytext": (6, -3), "textcoords": "offset points", "fontsize": SMALL_PT}
+        place = {"xytext": (6, -3), "textcoords": "offset points", "fontsize": canvas.SMALL_PT}
         ax.annotate(str(right.n), (stated, right.value), **place)
     ax.set(xlim=(0, 1.04), ylim=(-0.02, 1.04), aspect="equal")
-    legend_above(ax)
-    return label_axes(ax, x="probability stated", y="share that was right")
+    canvas.legend_above(ax)
+    return canvas.label_axes(ax, x="probability stated", y="share that was right")
 
 
 def confusion_matrix(truths: Sequence[str], said: Sequence[str], counts: IntArray) -> Axes:
     """Draw the number of cases by truth and answer, (n_truths, n_said), shaded by its share of the row."""
-    ax = grid_of_axes(1, 1, size_in=(3.0 + 0.34 * len(said), 2.4 + 0.3 * len(truths)))[0, 0]
+    ax = canvas.grid_of_axes(1, 1, size_in=(3.0 + 0.34 * len(said), 2.4 + 0.3 * len(truths)))[0, 0]
     shares = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
     ax.imshow(shares, cmap="Blues", vmin=0, vmax=1, aspect="auto")
     for (row, column), n in np.ndenumerate(counts):
         if n:
-            colour = "white" if shares[row, column] > 0.6 else BLACK
-            ax.text(column, row, str(n), ha="center", va="center", fontsize=SMALL_PT, color=colour)
-    ax.set_xticks(np.arange(len(said)), said, rotation=60, ha="right", rotation_mode="anchor", fontsize=SMALL_PT)
-    ax.set_yticks(np.arange(len(truths)), truths, fontsize=SMALL_PT)
-    return label_axes(ax, x="most probable", y="concealed")
+            colour = "white" if shares[row, column] > 0.6 else canvas.BLACK
+            ax.text(column, row, str(n), ha="center", va="center", fontsize=canvas.SMALL_PT, color=colour)
+    ax.set_xticks(np.arange(len(said)), said, rotation=60, ha="right", rotation_mode="anchor", fontsize=canvas.SMALL_PT)
+    ax.set_yticks(np.arange(len(truths)), truths, fontsize=canvas.SMALL_PT)
+    return canvas.label_axes(ax, x="most probable", y="concealed")
 
 
 _PANELS = (
@@ -174,16 +143,16 @@ def effect_and_size_in_words(row: ConcealedRow) -> str:
     return name if row.size is None else f"{name}, {row.size:g}"
 
 
-def doubt_against_trust(rows: Sequence[ConcealedRow]) -> AxesGrid:
+def doubt_against_trust(rows: Sequence[ConcealedRow]) -> canvas.AxesGrid:
     """Compare doubt in the sensor model with trust: runs sure and wrong, intervals that hold, median readings.
 
     `rows` are drawn from the top in this order. Returns axes, (1, 3).
     """
     names = list(dict.fromkeys(effect_and_size_in_words(row) for row in rows))
-    axes = grid_of_axes(1, 3, size_in=(PAGE_IN, 1.7 + 0.32 * len(names)), sharey=True)
+    axes = canvas.grid_of_axes(1, 3, size_in=(canvas.PAGE_IN, 1.7 + 0.32 * len(names)), sharey=True)
     arms: Mapping[str, tuple[list[ConcealedRow], str, str, float]] = {
-        "trusts its sensor": ([row for row in rows if row.trust == 1], VERMILLION, "s", 0.15),
-        "doubts its sensor": ([row for row in rows if row.trust < 1], BLUE, "o", -0.15),
+        "trusts its sensor": ([row for row in rows if row.trust == 1], canvas.VERMILLION, "s", 0.15),
+        "doubts its sensor": ([row for row in rows if row.trust < 1], canvas.BLUE, "o", -0.15),
     }
     for ax, (field, title, x) in zip(axes[0], _PANELS, strict=True):
         for label, (those, colour, marker, shift) in arms.items():
@@ -197,12 +166,12 @@ def doubt_against_trust(rows: Sequence[ConcealedRow]) -> AxesGrid:
                 ax.errorbar(values, y, **style)
         ax.set_xlim(*((0, None) if field == "readings" else (-0.03, 1.03)))
         if field == "intervals_hold":
-            ax.axvline(0.95, color=GREY, linewidth=0.9, linestyle="--")
-        ax.grid(axis="x", color=GREY, alpha=0.25)
+            ax.axvline(0.95, color=canvas.GREY, linewidth=0.9, linestyle="--")
+        ax.grid(axis="x", color=canvas.GREY, alpha=0.25)
         ax.set_yticks(np.arange(len(names)), names)
-        label_axes(ax, x=x, y="", title=title)
+        canvas.label_axes(ax, x=x, y="", title=title)
     axes[0, 0].set_ylim(len(names) - 0.5, -0.5)
-    legend_below(axes)
+    canvas.legend_below(axes)
     return axes
 
 
@@ -234,32 +203,32 @@ _INTERVALS = (
 )
 
 
-def study_page(results: Mapping[Trial, Result], *, command: str) -> CampaignPage:
+def study_page(results: Mapping[study.Trial, Result], *, command: str) -> CampaignPage:
     """Return what a study comes to; `command` is the command line that made it."""
-    found, own, first = summaries(results), trials_by_row(results), next(iter(results))
+    found, own, first = study.summaries(results), study.trials_by_row(results), next(iter(results))
     sentence = study_sentence(found)
     usual = (
         row
         for row in found
-        if (row.utility == REFERENCE.utility or row.method == "paper")
+        if (row.utility == study.REFERENCE.utility or row.method == "paper")
         and (row.noise_sd, row.width, row.batch) == (1.0, 1.0, 1)
     )
     curves = {row.name: [np.asarray(t["widest_mm"], dtype=np.float64) for t in own[row]] for row in usual}
 
     def html(draw: Draw) -> str:
         needed = figure(
-            draw("readings needed", lambda: png(readings_needed({row.name: own for row, own in found.items()}))),
+            draw("readings needed", lambda: canvas.png(readings_needed({row.name: own for row, own in found.items()}))),
             f"Readings until every length is known to 4 mm, of at most {first.max_readings}; a miss counts as that "
             "many.",
         )
-        tables = (
+        both = (
             table_of(_READINGS, found.items(), caption=_INTERVALS),
             table_of(_WORTH, found.items(), caption="Information per reading, errors of the runs, and cost."),
         )
-        sections = [Section("The table", (fragment(*tables), paragraph(_STUDY_LEGEND)))]
+        sections = [Section("The table", (fragment(*both), paragraph(_STUDY_LEGEND)))]
         if curves:
             drawn = figure(
-                draw("widths", lambda: png(posterior_widths_of_runs(curves))),
+                draw("widths", lambda: canvas.png(posterior_widths_of_runs(curves))),
                 "Widest posterior sd of a length against the number of readings; a run that has ended keeps its last "
                 "width.",
             )
@@ -288,7 +257,7 @@ _STUDY_LEGEND = (
 )
 
 
-def study_sentence(table: Mapping[SearchConfiguration, Summary]) -> str:
+def study_sentence(table: Mapping[study.SearchConfiguration, study.Summary]) -> str:
     """Summarise a study's first row: mean and median readings, and the share of runs that reached the precision."""
     row, found = next(iter(table.items()))
     share = "All" if found.reached.value == 1 else f"{number_text(100 * found.reached.value, 1)} % of the"
@@ -298,7 +267,7 @@ def study_sentence(table: Mapping[SearchConfiguration, Summary]) -> str:
     )
 
 
-Row: TypeAlias = tuple[SearchConfiguration, Summary]
+Row: TypeAlias = tuple[study.SearchConfiguration, study.Summary]
 
 _READINGS: Columns[Row] = {
     "row": lambda r: r[0].name,
@@ -330,7 +299,7 @@ _WORTH: Columns[Row] = {
 }
 
 
-def lower_bound_table(found: Mapping[SearchConfiguration, Summary]) -> Markup | None:
+def lower_bound_table(found: Mapping[study.SearchConfiguration, study.Summary]) -> Markup | None:
     """Build the table of lower bounds, for any strategy, on mean readings up to the first on white, and after it.
 
     Measured means are beside; None if no row has default options (but for circles and noise) and the correct model.
@@ -341,8 +310,8 @@ def lower_bound_table(found: Mapping[SearchConfiguration, Summary]) -> Markup | 
 
     lines = []
     for row, own in found.items():
-        if row == replace(REFERENCE, population=row.population, noise_sd=row.noise_sd):
-            least = least_readings(experiment_of(row), rng=np.random.default_rng(0))
+        if row == replace(study.REFERENCE, population=row.population, noise_sd=row.noise_sd):
+            least = least_readings(study.experiment_of(row), rng=np.random.default_rng(0))
             search = over(least.search_bits, least.search_capacity_bits), _with_error(own.to_white)
             after = over(least.refinement_bits, least.capacity_bits), _with_error(own.after_white)
             lines.append((row.name, *search, *after))
@@ -350,7 +319,7 @@ def lower_bound_table(found: Mapping[SearchConfiguration, Summary]) -> Markup | 
     return table(("row", places[0], "measured", places[1], "measured"), lines) if lines else None
 
 
-def study_csv(table: Mapping[SearchConfiguration, Summary]) -> str:
+def study_csv(table: Mapping[study.SearchConfiguration, study.Summary]) -> str:
     """Return a study's table as CSV text: estimates with bounds; processor times, which vary, are left out."""
     ends, others = ("value", "low", "high"), ("error_mm", "wrong", "wrong_expected", "wrong_limit")
     rows = []
@@ -383,7 +352,7 @@ def concealed_page(results: Mapping[ConcealedTrial, Result], *, command: str) ->
 
     def html(draw: Draw) -> str:
         drawn = figure(
-            draw("doubt against trust", lambda: png(doubt_against_trust(rows))),
+            draw("doubt against trust", lambda: canvas.png(doubt_against_trust(rows))),
             "Each row conceals one effect from an otherwise exact sensor model; bars are 95 % intervals. Sure and "
             "wrong: the robot has ended its search with a length off by more than 12 mm. Dashed: what the intervals "
             "promise.",
@@ -435,7 +404,11 @@ _CONCEALED_LEGEND = (
 
 
 def challenge_page(
-    results: Results, score: Callable[[Results], Sequence[ScoreRow]], *, command: str, systems: bool
+    results: tables.Results,
+    score: Callable[[tables.Results], Sequence[tables.ScoreRow]],
+    *,
+    command: str,
+    systems: bool,
 ) -> CampaignPage:
     """Return what a challenge comes to, by the `score` of its cases; `command` is the command line that made it.
 
@@ -447,9 +420,9 @@ def challenge_page(
     def html(draw: Draw) -> str:
         sections = [Section("The table", (table_of(_TARGETS, rows), paragraph(_CHALLENGE_LEGEND)))]
         if done:
-            counts = partial(confusion_counts, done, label=name_without_target if systems else str)
+            counts = partial(tables.confusion_counts, done, label=tables.name_without_target if systems else str)
             drawn = figure(
-                draw("confusion matrix", lambda: png(confusion_matrix(*counts()))),
+                draw("confusion matrix", lambda: canvas.png(confusion_matrix(*counts()))),
                 "Rows: what was concealed. Columns: the most probable hypothesis. An alias of the truth counts as the "
                 "truth." + (" Targets are left out." if systems else ""),
             )
@@ -462,7 +435,7 @@ def challenge_page(
         if failures:
             sections.append(Section("Cases that failed", (definition_list(failures),)))
         honest = figure(
-            draw("reliability", lambda: png(reliability_diagram(reliability_bins(done)))),
+            draw("reliability", lambda: canvas.png(reliability_diagram(tables.reliability_bins(done)))),
             "How often the most probable hypothesis was right, against the probability stated for it, with 95 % "
             "intervals.",
         )
@@ -480,7 +453,7 @@ _CHALLENGE_LEGEND = (
 )
 
 
-def challenge_sentence(rows: Sequence[ScoreRow], n_cases: int) -> str:
+def challenge_sentence(rows: Sequence[tables.ScoreRow], n_cases: int) -> str:
     """Summarise a challenge in one sentence: number of cases; how many targets are met, missed and undecided."""
     n = {kind: sum(row.decision == kind for row in rows) for kind in ("met", "missed", "open")}
     return (
@@ -489,7 +462,7 @@ def challenge_sentence(rows: Sequence[ScoreRow], n_cases: int) -> str:
     )
 
 
-_TARGETS: Columns[ScoreRow] = {
+_TARGETS: Columns[tables.ScoreRow] = {
     # Indented by an em space, since HTML drops plain spaces.
     "what": lambda row: "\u2003" * row.name.startswith(" ") + row.name.lstrip().replace("_", " "),
     "found": lambda row: _value_text(row.found) if row.found.n else "–",
@@ -500,7 +473,7 @@ _TARGETS: Columns[ScoreRow] = {
 }
 
 
-def challenge_csv(rows: Sequence[ScoreRow]) -> str:
+def challenge_csv(rows: Sequence[tables.ScoreRow]) -> str:
     """Return a challenge's table as CSV text: quantity, value, interval, cases, target's bounds, decision."""
     cells = []
     for row in rows:
@@ -510,17 +483,17 @@ def challenge_csv(rows: Sequence[ScoreRow]) -> str:
     return csv_text_of_rows(["what", "found", "low", "high", "n", "target_least", "target_most", "decision"], cells)
 
 
-def _effect_table(done: Results) -> Markup:
+def _effect_table(done: tables.Results) -> Markup:
     return table(
         ("effect", "cases", "detected at alpha .01", "named first"),
         (
             (name, str(detected.n), *(f"{_value_text(e)} ({_interval_text(e)})" for e in (detected, named)))
-            for name, (detected, named) in detected_and_named_by_effect(done).items()
+            for name, (detected, named) in tables.detected_and_named_by_effect(done).items()
         ),
     )
 
 
-def _case_table(results: Results) -> Markup:
+def _case_table(results: tables.Results) -> Markup:
     gained = "held-out gain, and that of the right model (nats)"
     return table(
         ("case", "system", "concealed", "lambda", "said", "probability", "right", gained),
@@ -533,11 +506,11 @@ def _case_cells(number: int, result: Result) -> tuple[str, ...]:
     begun = (str(number), result.get("system", ""), concealed, f"{result['size']:g}" if result["size"] else "")
     if "failed" in result:
         return (*begun, f"failed: {result['failed']}", "", "no", "")
-    names, probability = leading_hypothesis(result, clean=True)
+    names, probability = tables.leading_hypothesis(result, clean=True)
     # Beside a concealed effect, all of which act on the mean, names of noise effects are ignored.
-    physics = tuple(name for name in names if name not in NOISE) if result["hidden"] else names
-    right = are_names_right(result, physics, noise=not result["hidden"])
-    gains = gains_on_held_out_runs(result)
+    physics = tuple(name for name in names if name not in tables.NOISE) if result["hidden"] else names
+    right = tables.are_names_right(result, physics, noise=not result["hidden"])
+    gains = tables.gains_on_held_out_runs(result)
     said = " and ".join(names) or "clean"
     return (
         *begun,
@@ -556,7 +529,7 @@ def _interval_text(found: Estimate) -> str:
     return f"{found.low:.3g} to {found.high:.3g}" if math.isfinite(found.high - found.low) else ""
 
 
-def _target_text(row: ScoreRow) -> str:
+def _target_text(row: tables.ScoreRow) -> str:
     if row.decision is None:
         return ""
     if math.isinf(row.least):

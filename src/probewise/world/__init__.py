@@ -4,29 +4,22 @@ It shares only the file formats with the rest of the package: data simulated by 
 the model. The summed integral is the paper's eq. RwithSSF.
 """
 
-from probewise.world.concealed import ambient_gradient, backlash, correlated_noise, gain_drift, nonlinearity, saturation
+from probewise.world.concealed import saturation
 from probewise.world.spots import Blob, Spot, gaussian_spot, raster_spot, ridge_spot, ring_spot, tailed_spot
-from probewise.world.stages import Concealed, Rows
+from probewise.world.stages import Concealed
 from probewise.world.surfaces import CoveredSurface, Oval, Surface, albedo_at, seen_white_fraction
-from probewise.world.world import View, World
+from probewise.world.world import World
 
 __all__ = [
     "Blob",
     "Concealed",
     "CoveredSurface",
     "Oval",
-    "Rows",
     "Spot",
     "Surface",
-    "View",
     "World",
     "albedo_at",
-    "ambient_gradient",
-    "backlash",
-    "correlated_noise",
-    "gain_drift",
     "gaussian_spot",
-    "nonlinearity",
     "raster_spot",
     "ridge_spot",
     "ring_spot",

@@ -6,11 +6,12 @@ import functools
 import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, ParamSpec, TypeAlias, get_args
+from typing import Any, ParamSpec, TypeAlias
 
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise.errors import require
 from probewise.world.spots import Spot
 
 
@@ -52,25 +53,10 @@ class Rows:
         return np.concatenate([[True], self.scan[1:] != self.scan[:-1]])
 
 
-Stage: TypeAlias = Literal[
-    "place",
-    "turn",
-    "pattern",
-    "albedo",
-    "tilt",
-    "height",
-    "footprint",
-    "seen",
-    "response",
-    "gain",
-    "offset",
-    "lag",
-    "saturation",
-    "noise",
-    "quantisation",
-    "loss",
-]
-STAGES: tuple[Stage, ...] = get_args(Stage)
+STAGES = (
+    *("place", "turn", "pattern", "albedo", "tilt", "height", "footprint", "seen"),
+    *("response", "gain", "offset", "lag", "saturation", "noise", "quantisation", "loss"),
+)
 """In order: pose, scene, footprint, u, response, gain, offsets, lag, saturation, noise, rounding."""
 
 AFTER_VIEW = STAGES[STAGES.index("response") :]
@@ -106,7 +92,7 @@ class Concealed:
     """An effect that a world conceals: name, stage, parameters by name, how it acts, and the kind that makes it."""
 
     name: str
-    stage: Stage
+    stage: str  # one of STAGES
     parameters: Mapping[str, Any] = field(hash=False)
     act: Act = field(compare=False, repr=False)
     kind: Callable[..., Concealed] = field(compare=False, repr=False)
@@ -125,8 +111,9 @@ KINDS: dict[str, Callable[..., Concealed]] = {}
 """Every kind of effect by name, as `acts_at` made it."""
 
 
-def acts_at(stage: Stage) -> Callable[[Callable[P, Act]], Callable[P, Concealed]]:
+def acts_at(stage: str) -> Callable[[Callable[P, Act]], Callable[P, Concealed]]:
     """Make a kind of effect of a function from parameters to how it acts: called, it returns the effect of its name."""
+    require(stage in STAGES, "stage", stage, f"one of {', '.join(STAGES)}")
 
     def kind_of_effect(act_with: Callable[P, Act]) -> Callable[P, Concealed]:
         @functools.wraps(act_with)

@@ -14,7 +14,7 @@ from probewise._kinds import require_rng
 from probewise.errors import ParameterError, require
 from probewise.recordings.plan import Plan, Recording
 from probewise.world.spots import Spot
-from probewise.world.stages import STAGES, Concealed, FootprintPart, Rows, Stage
+from probewise.world.stages import Concealed, FootprintPart, Rows
 from probewise.world.surfaces import Surface, common_edge_normal, distance_to_nearest_edge, seen_white_fraction
 
 _Surfaces = Sequence[tuple[Surface, IntArray]]
@@ -66,8 +66,6 @@ class World:
         require(self.noise_sd >= 0, "noise_sd", self.noise_sd, "0 or more")
         require(self.step is None or self.step > 0, "step", self.step, "greater than 0, or None")
         require(self.height_mm > 0, "height_mm", self.height_mm, "greater than 0")
-        for effect in self.concealed:
-            require(effect.stage in STAGES, f"{effect.name}.stage", effect.stage, f"one of {', '.join(STAGES)}")
 
     def read(
         self,
@@ -133,8 +131,7 @@ class World:
         rows = view.rows
         signal = (self.white - self.black) * self._with_effects("response", view.seen, rows) * view.dimming
         reading: FloatArray = self.black + self._with_effects("gain", signal, rows)
-        stages: tuple[Stage, ...] = ("offset", "lag", "saturation")
-        for stage in stages:
+        for stage in ("offset", "lag", "saturation"):
             reading = self._with_effects(stage, reading, rows)
         return reading
 
@@ -205,7 +202,7 @@ class World:
             readings = np.round(readings / self.step) * self.step
         return np.asarray(readings if rng is None else self._with_effects("loss", readings, view.rows, view.seen, rng))
 
-    def _with_effects(self, stage: Stage, values: Any, *more: Any) -> Any:
+    def _with_effects(self, stage: str, values: Any, *more: Any) -> Any:
         """Return what the chain has at a stage with the effects of that stage (`stages.Act`)."""
         for effect in self.concealed:
             if effect.stage == stage:

@@ -41,7 +41,7 @@ def test_a_case_that_cannot_be_drawn_is_noted(monkeypatch):
     def fails(*_, **__):
         raise ZeroDivisionError("by zero")
 
-    monkeypatch.setattr("probewise.proof.challenge.draw_case", fails)
+    monkeypatch.setattr("probewise.proof.sensors.draw_case", fails)
     found = run_case(Task(1, 0))
     assert (found["failed"], found["at"]) == ("ZeroDivisionError: by zero", "drawing")
     assert found["kind"] == stratum_of(0)[0].kind

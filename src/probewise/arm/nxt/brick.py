@@ -16,27 +16,9 @@ from typing import Self
 from probewise._signals import defer_signals
 from probewise.arm.geometry import ROOM_COUNTS, Geometry, SoftLimits
 from probewise.arm.instrument import Clock, Side
+from probewise.arm.nxt import telegram as nxt
 from probewise.arm.nxt.link import Link, SerialPort
 from probewise.arm.nxt.motor import DriveParameters, Guard, Motor
-from probewise.arm.nxt.telegram import (
-    ALL_OUTPUTS,
-    GET_BATTERY_LEVEL,
-    GET_CURRENT_PROGRAM_NAME,
-    GET_DEVICE_INFO,
-    GET_FIRMWARE_VERSION,
-    LED_OFF,
-    LED_ON,
-    NO_SENSOR,
-    RAW,
-    BrickError,
-    FirmwareVersion,
-    InputValues,
-    Request,
-    TelegramError,
-    get_input_values,
-    set_input_type,
-    set_output_state,
-)
 from probewise.errors import LinkError, LowBatteryWarning, require
 
 AD_MAX = 1023
@@ -76,8 +58,8 @@ class LightSensor:
 
     def set_led(self, lit: bool = True) -> None:
         """Switch the LED on (`lit`) or off, and set the input to raw readings."""
-        self._type = LED_ON if lit else LED_OFF
-        self._link.ask(set_input_type(self.port, self._type))
+        self._type = nxt.LED_ON if lit else nxt.LED_OFF
+        self._link.ask(nxt.set_input_type(self.port, self._type))
 
     def flash(self) -> int:
         """Light the LED for one reading, as in the paper: it is at the same temperature in all of them.
@@ -105,8 +87,8 @@ class LightSensor:
         number = 0
         while True:
             number += 1
-            values = self._link.ask(get_input_values(self.port), check=_require_consistent)
-            as_set = (values.type, values.mode) == (self._type, RAW)
+            values = self._link.ask(nxt.get_input_values(self.port), check=_require_consistent)
+            as_set = (values.type, values.mode) == (self._type, nxt.RAW)
             # An invalid reading still holds the old values.
             if as_set and values.valid:
                 return values.raw
@@ -116,25 +98,27 @@ class LightSensor:
                     "is the light sensor plugged in?"
                 )
             if not as_set:  # a program that starts or stops resets all settings
-                self.set_led(self._type == LED_ON)
+                self.set_led(self._type == nxt.LED_ON)
 
     @property
-    def off_command(self) -> Request[None]:
+    def off_command(self) -> nxt.Request[None]:
         """The command that switches the LED off and unconfigures the input."""
-        return set_input_type(self.port, NO_SENSOR)
+        return nxt.set_input_type(self.port, nxt.NO_SENSOR)
 
 
-def _require_consistent(values: InputValues) -> None:
+def _require_consistent(values: nxt.InputValues) -> None:
     """Raise TelegramError if counts and converted values contradict each other: a byte was corrupted on the way.
 
     The protocol has no checksum, but the firmware sends each reading four times, as counts and converted.
     """
     possible = values.valid in (0, 1) and not values.calibrated and values.raw <= AD_MAX
-    if possible and values.valid and values.type in (LED_ON, LED_OFF) and values.mode == RAW:
+    if possible and values.valid and values.type in (nxt.LED_ON, nxt.LED_OFF) and values.mode == nxt.RAW:
         converted = {values.normalized, values.scaled, values.calibrated_value}
         possible = converted == {normalized_from_counts(values.raw)}
     if not possible:
-        raise TelegramError(f"input {values.port + 1} says {values}: counts and converted values contradict each other")
+        raise nxt.TelegramError(
+            f"input {values.port + 1} says {values}: counts and converted values contradict each other"
+        )
 
 
 LOW_MV = 6000
@@ -193,7 +177,7 @@ class Brick:
         LinkError if the brick does not answer, or no two of six successive voltages agree.
         """
         for _ in range(N_ASKED):
-            before, self._last_mv = self._last_mv, self.link.ask(GET_BATTERY_LEVEL)
+            before, self._last_mv = self._last_mv, self.link.ask(nxt.GET_BATTERY_LEVEL)
             if before is not None and abs(self._last_mv - before) <= STEP_MV:
                 break
         else:
@@ -212,17 +196,17 @@ class Brick:
 
     def name(self) -> str:
         """Return the brick's name."""
-        return self.link.ask(GET_DEVICE_INFO)
+        return self.link.ask(nxt.GET_DEVICE_INFO)
 
-    def version(self) -> FirmwareVersion:
+    def version(self) -> nxt.FirmwareVersion:
         """Return the versions of the brick's firmware and protocol."""
-        return self.link.ask(GET_FIRMWARE_VERSION)
+        return self.link.ask(nxt.GET_FIRMWARE_VERSION)
 
     def running_program(self) -> str | None:
         """Return the file name of the program running on the brick, which could drive motors and sensors, or None."""
         try:
-            return self.link.ask(GET_CURRENT_PROGRAM_NAME)
-        except BrickError as error:
+            return self.link.ask(nxt.GET_CURRENT_PROGRAM_NAME)
+        except nxt.BrickError as error:
             if error.status == NO_PROGRAM:
                 return None
             raise
@@ -232,8 +216,8 @@ class Brick:
 
         First send all commands without asking for answers, which may be missing or late; then send them with answers.
         """
-        commands: list[Request[None]] = [
-            set_output_state(ALL_OUTPUTS),
+        commands: list[nxt.Request[None]] = [
+            nxt.set_output_state(nxt.ALL_OUTPUTS),
             *(light.off_command for light in self._lights.values()),
         ]
         failures = []

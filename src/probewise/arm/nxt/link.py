@@ -17,19 +17,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, Self, TypeVar
 
 from probewise.arm.instrument import Clock
-from probewise.arm.nxt.telegram import (
-    GET_BATTERY_LEVEL,
-    GET_FIRMWARE_VERSION,
-    KEEP_ALIVE,
-    LONGEST,
-    BrickError,
-    Reply,
-    Request,
-    TelegramError,
-    decode,
-    encode,
-    framed,
-)
+from probewise.arm.nxt import telegram as nxt
 from probewise.errors import LinkError
 
 if TYPE_CHECKING:
@@ -38,7 +26,7 @@ if TYPE_CHECKING:
 
 A = TypeVar("A")
 
-FENCES: tuple[Request[Any], ...] = (GET_BATTERY_LEVEL, GET_FIRMWARE_VERSION, KEEP_ALIVE)
+FENCES: tuple[nxt.Request[Any], ...] = (nxt.GET_BATTERY_LEVEL, nxt.GET_FIRMWARE_VERSION, nxt.KEEP_ALIVE)
 UNKNOWN = -1  # a question sent by another program before this one began
 
 
@@ -91,7 +79,7 @@ class Link:
         self._free_at = clock.monotonic()
         self._awake_until = clock.monotonic()
 
-    def ask(self, request: Request[A], *, check: Callable[[A], None] | None = None) -> A:
+    def ask(self, request: nxt.Request[A], *, check: Callable[[A], None] | None = None) -> A:
         """Send a command and return the answer; repeat one that does no harm if that is missing or corrupted.
 
         `check` raises TelegramError for an impossible answer. Raises BrickError if the brick refuses the command, again
@@ -102,25 +90,25 @@ class Link:
         for n_left in reversed(range(1 + self._timing.n_repeats if request.is_repeatable else 1)):
             try:
                 self._await_turn()
-                if self._owed or self._stream.read(LONGEST, 0.0):
+                if self._owed or self._stream.read(nxt.LONGEST, 0.0):
                     self._discard_late_answers()
                 answer = request.decode_answer(self._exchange(request))
                 if check is not None:
                     check(answer)
-            except (NoAnswerError, TelegramError):
+            except (NoAnswerError, nxt.TelegramError):
                 self._owed.add(request.opcode)
                 if not n_left:
                     raise
-            except BrickError:
+            except nxt.BrickError:
                 if not n_left:
                     raise
             else:
                 return answer
         raise AssertionError("a question is asked at least once")  # pragma: no cover
 
-    def tell(self, request: Request[A]) -> None:
+    def tell(self, request: nxt.Request[A]) -> None:
         """Send a command without requesting an answer; whether the brick executed it is unknown."""
-        self._send(encode(request, wants_reply=False))
+        self._send(nxt.encode(request, wants_reply=False))
         self._free_at = self._clock.monotonic() + self._timing.gap_s
 
     def keep_awake(self) -> None:
@@ -129,7 +117,7 @@ class Link:
             return
         # Set first: `ask` calls this method.
         self._awake_until = self._clock.monotonic() + self._timing.keep_awake_s
-        limit_s = self.ask(KEEP_ALIVE) / 1000
+        limit_s = self.ask(nxt.KEEP_ALIVE) / 1000
         if limit_s > 0:
             self._awake_until = self._clock.monotonic() + min(self._timing.keep_awake_s, limit_s / 3)
 
@@ -137,10 +125,10 @@ class Link:
         """Close the connection."""
         self._stream.close()
 
-    def _exchange(self, request: Request[A]) -> Reply:
+    def _exchange(self, request: nxt.Request[A]) -> nxt.Reply:
         """Send a command and return its reply, which counts as owed until received."""
         self._owed.add(request.opcode)
-        self._send(encode(request))
+        self._send(nxt.encode(request))
         sent_at = self._clock.monotonic()
         self._free_at = sent_at + 2 * self._timing.turn_s
         reply = self._await_reply(request, sent_at + self._timing.answer_s)
@@ -156,7 +144,7 @@ class Link:
                 continue
             try:
                 self._exchange(fence)
-            except (NoAnswerError, TelegramError):
+            except (NoAnswerError, nxt.TelegramError):
                 self._drain()
             else:
                 self._owed.clear()
@@ -166,12 +154,12 @@ class Link:
     def _drain(self) -> None:
         """Read and drop bytes (late or incomplete answers) until the stream is silent, for `answer_s` at most."""
         deadline = self._clock.monotonic() + self._timing.answer_s
-        while self._clock.monotonic() < deadline and self._stream.read(LONGEST, self._timing.silence_s):
+        while self._clock.monotonic() < deadline and self._stream.read(nxt.LONGEST, self._timing.silence_s):
             pass
 
     def _send(self, telegram: bytes) -> None:
         self._await_turn()
-        self._stream.write(framed(telegram))
+        self._stream.write(nxt.framed(telegram))
         self.n_sent += 1
 
     def _await_turn(self) -> None:
@@ -179,22 +167,22 @@ class Link:
         if wait_s > 0:
             self._clock.sleep(wait_s)
 
-    def _await_reply(self, request: Request[A], deadline: float) -> Reply:
+    def _await_reply(self, request: nxt.Request[A], deadline: float) -> nxt.Reply:
         while True:
             length = int.from_bytes(self._read_exactly(2, request, deadline), "little")
-            if not 2 <= length <= LONGEST:
-                raise TelegramError(f"a telegram of {length} bytes was announced; allowed: 2 to {LONGEST}")
+            if not 2 <= length <= nxt.LONGEST:
+                raise nxt.TelegramError(f"a telegram of {length} bytes was announced; allowed: 2 to {nxt.LONGEST}")
             telegram = self._read_exactly(length, request, deadline)
             try:
-                reply = decode(telegram)
-            except TelegramError:
+                reply = nxt.decode(telegram)
+            except nxt.TelegramError:
                 continue  # a program on the brick may send telegrams too
             if reply.opcode == request.opcode:
                 return reply
             if reply.opcode not in self._owed:
-                raise TelegramError(f"a reply to opcode {reply.opcode:02X} came, which was not asked for")
+                raise nxt.TelegramError(f"a reply to opcode {reply.opcode:02X} came, which was not asked for")
 
-    def _read_exactly(self, size: int, request: Request[A], deadline: float) -> bytes:
+    def _read_exactly(self, size: int, request: nxt.Request[A], deadline: float) -> bytes:
         """Read exactly `size` bytes, in any number of pieces; NoAnswerError at the deadline."""
         got = b""
         while len(got) < size:

@@ -15,21 +15,8 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from probewise.arm.instrument import Clock, Side
+from probewise.arm.nxt import telegram as nxt
 from probewise.arm.nxt.link import Link, NoAnswerError
-from probewise.arm.nxt.telegram import (
-    BRAKE,
-    BY_SPEED,
-    IDLE,
-    MOTOR_ON,
-    REGULATED,
-    RUNNING,
-    BrickError,
-    OutputState,
-    TelegramError,
-    get_output_state,
-    reset_rotation_counter,
-    set_output_state,
-)
 from probewise.errors import LinkError
 
 Guard: TypeAlias = Callable[[int, int], None]
@@ -38,8 +25,8 @@ Guard: TypeAlias = Callable[[int, int], None]
 COUNTS_S = 10.0  # counts per second and unit of power
 STUCK, BEYOND = "is stuck at", "runs on beyond its goal, to"
 FAINT_POWER = 1  # a motor needs about 8 to overcome its own friction
-BRAKED = MOTOR_ON | BRAKE
-DRIVEN = BRAKED | REGULATED
+BRAKED = nxt.MOTOR_ON | nxt.BRAKE
+DRIVEN = BRAKED | nxt.REGULATED
 N_ASKED = 6  # largest number of queries until two successive states agree
 N_UNTAKEN = 3  # successive commands ignored by the brick after which a move fails
 
@@ -101,14 +88,14 @@ class Motor:
     def reset_counter(self) -> None:
         """Set the rotation counter to 0."""
         state = self._read_confirmed_state()
-        self._link.ask(reset_rotation_counter(self.port))
+        self._link.ask(nxt.reset_rotation_counter(self.port))
         if self._target is not None:
             self._target -= state.rotation_counts
         self._offsets = state.tacho_counts, state.tacho_counts - state.block_counts
 
     def hold(self) -> None:
         """Stop the motor and hold its position against a load."""
-        self._link.ask(set_output_state(self.port, 0, DRIVEN, BY_SPEED, run_state=RUNNING))
+        self._link.ask(nxt.set_output_state(self.port, 0, DRIVEN, nxt.BY_SPEED, run_state=nxt.RUNNING))
 
     def stop_and_settle(self) -> int:
         """Stop and hold the motor; return its count once it has settled."""
@@ -118,7 +105,7 @@ class Motor:
 
     def release(self) -> None:
         """Let the motor turn freely."""
-        self._link.ask(set_output_state(self.port))
+        self._link.ask(nxt.set_output_state(self.port))
         self._arrived = None
 
     def move_to(self, goal: int, side: Side) -> int:
@@ -228,10 +215,12 @@ class Motor:
         self, target: int, side: Side, power: int, limit: int, *, gently: bool = False
     ) -> bool:
         """Command a limited move, exactly once; return whether the brick accepted it; at the third refusal raise."""
-        mode, regulation = (BRAKED, 0) if gently else (DRIVEN, BY_SPEED)
+        mode, regulation = (BRAKED, 0) if gently else (DRIVEN, nxt.BY_SPEED)
         try:
-            self._link.ask(set_output_state(self.port, power, mode, regulation, run_state=RUNNING, limit_counts=limit))
-        except (NoAnswerError, TelegramError, BrickError) as error:
+            self._link.ask(
+                nxt.set_output_state(self.port, power, mode, regulation, run_state=nxt.RUNNING, limit_counts=limit)
+            )
+        except (NoAnswerError, nxt.TelegramError, nxt.BrickError) as error:
             # Holding sets the limit to 0 after every move, so this limit confirms that the brick accepted the command.
             took = self._read_confirmed_state(lambda state: False).limit_counts == limit
             if not took or self._target is None:
@@ -250,10 +239,10 @@ class Motor:
         The power is too little to turn the motor, so that a lost connection or a repeated command does no harm.
         """
 
-        def has_faint_power(state: OutputState) -> bool:
-            return (state.power, state.run_state, state.limit_counts) == (FAINT_POWER, RUNNING, 0)
+        def has_faint_power(state: nxt.OutputState) -> bool:
+            return (state.power, state.run_state, state.limit_counts) == (FAINT_POWER, nxt.RUNNING, 0)
 
-        self._link.ask(set_output_state(self.port, FAINT_POWER, BRAKED, run_state=RUNNING))
+        self._link.ask(nxt.set_output_state(self.port, FAINT_POWER, BRAKED, run_state=nxt.RUNNING))
         self._clock.sleep(self.drive.settle_s)
         state = self._read_confirmed_state(has_faint_power)
         if not has_faint_power(state):
@@ -265,12 +254,12 @@ class Motor:
         """Wait for a limited move to end; return `STUCK` or `BEYOND` if the motor sticks or overruns, otherwise ""."""
         side = 1 if farthest > 0 else -1
 
-        def is_plausible(state: OutputState) -> bool:
+        def is_plausible(state: nxt.OutputState) -> bool:
             # The firmware releases a motor at its target, not before.
-            return state.run_state == RUNNING or side * (state.rotation_counts - target) >= 0
+            return state.run_state == nxt.RUNNING or side * (state.rotation_counts - target) >= 0
 
         here, changed_at = start, self._clock.monotonic()
-        while (state := self._read_confirmed_state(is_plausible)).run_state != IDLE:
+        while (state := self._read_confirmed_state(is_plausible)).run_state != nxt.IDLE:
             now = self._clock.monotonic()
             if state.rotation_counts != here:
                 here, changed_at = state.rotation_counts, now
@@ -280,7 +269,9 @@ class Motor:
                 return STUCK
         return ""
 
-    def _read_confirmed_state(self, is_plausible: Callable[[OutputState], bool] = lambda state: True) -> OutputState:
+    def _read_confirmed_state(
+        self, is_plausible: Callable[[nxt.OutputState], bool] = lambda state: True
+    ) -> nxt.OutputState:
         """Read the motor's state; if it is implausible or one counter jumped, read until two successive states agree.
 
         A corrupted byte changes one of the three counters but not the others.
@@ -300,15 +291,15 @@ class Motor:
             self._target, self._offsets = None, _counter_offsets(state)
         return state
 
-    def _read_state(self) -> OutputState:
-        return self._link.ask(get_output_state(self.port))
+    def _read_state(self) -> nxt.OutputState:
+        return self._link.ask(nxt.get_output_state(self.port))
 
 
-def _counter_offsets(state: OutputState) -> tuple[int, int]:
+def _counter_offsets(state: nxt.OutputState) -> tuple[int, int]:
     """Return the tacho counter minus the rotation and minus the block counter; motion does not change either."""
     return state.tacho_counts - state.rotation_counts, state.tacho_counts - state.block_counts
 
 
-def _constant_fields(state: OutputState) -> tuple[object, ...]:
+def _constant_fields(state: nxt.OutputState) -> tuple[object, ...]:
     """Return the fields, and differences of counters, that do not change while a motor turns."""
     return _counter_offsets(state), state.power, state.mode, state.regulation, state.run_state, state.limit_counts

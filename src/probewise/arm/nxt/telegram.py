@@ -27,11 +27,9 @@ OK = 0x00
 
 MEANINGS: Mapping[int, str] = {
     0x8A: "undefined error",
-    0xBD: "the request failed; is there a file of that name on the brick?",
     0xBE: "the brick does not know this command",
     0xBF: "the brick finds the telegram malformed",
     0xC0: "a value is out of range: a port that is none, or a file that is not there",
-    0xDD: "I2C bus error; is the sensor plugged in?",
     0xDE: "no room in the communication buffer",
     0xDF: "the connection is not valid",
     0xE0: "the port is busy, or not set up for such a sensor",

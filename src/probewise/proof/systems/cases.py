@@ -20,30 +20,14 @@ from scipy.optimize import brentq
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import NotConvergedError
 from probewise.proof.sensors import CLEAR, FAINT, GROSS, SMALL, Stratum, amplitude_of_size, stratum_in_wheel
-from probewise.proof.systems.forms import (
-    ADDED_FAMILIES,
-    FAMILIES,
-    OUT_OF_VOCABULARY,
-    Form,
-    SimulatedSystem,
-    SystemEffect,
-    family_of,
-    forms_of,
-    forms_out_of_vocabulary,
-)
+from probewise.proof.systems import forms
 from probewise.proof.systems.kinds import FORMULAS, LAWS, SystemKind, SystemTable, design_runs, draw_values
 from probewise.proof.systems.simulate import simulate_noise_free
 from probewise.recordings import write_text_atomically
 from probewise.recordings.table import csv_text
 
 OTHER_NOISE = (
-    "correlated_noise",
-    "outliers",
-    "signal_dependent_noise",
-    "t4",
-    "random_walk",
-    "quantised",
-    "noise_per_run",
+    *("correlated_noise", "outliers", "signal_dependent_noise", "t4", "random_walk", "quantised", "noise_per_run"),
     "dropouts",
 )
 """Kinds of noise of a clean recording, besides white; "t4" and "quantised" are not in the vocabulary."""
@@ -194,16 +178,16 @@ class DrawnSystem:
         return self.table.select_rows(self.diagnosed_row_numbers)
 
     @cached_property
-    def true_system(self) -> SimulatedSystem:
+    def true_system(self) -> forms.SimulatedSystem:
         """The system at its true parameters with readings and states, over the rows that are not held out."""
         return self._simulate(self.diagnosed_table, ())
 
-    def simulate_all_rows(self, effects: Sequence[SystemEffect]) -> FloatArray:
+    def simulate_all_rows(self, effects: Sequence[forms.SystemEffect]) -> FloatArray:
         """Return noise-free readings with these effects at all rows of `table`, (n_points,); not finite if diverged."""
         with np.errstate(all="ignore"):
             return self._simulate(self.table, effects).readings
 
-    def simulate_diagnosed_rows(self, effects: Sequence[SystemEffect]) -> FloatArray:
+    def simulate_diagnosed_rows(self, effects: Sequence[forms.SystemEffect]) -> FloatArray:
         """Return noise-free readings with these effects at the rows that are not held out, (n_points,).
 
         Raises NotConvergedError if a reading is not finite.
@@ -214,7 +198,7 @@ class DrawnSystem:
             raise NotConvergedError(f"the {self.kind.name} runs away")
         return readings
 
-    def _simulate(self, table: SystemTable, effects: Sequence[SystemEffect]) -> SimulatedSystem:
+    def _simulate(self, table: SystemTable, effects: Sequence[forms.SystemEffect]) -> forms.SimulatedSystem:
         own = {**self.shared, **{name: values[table.run] for name, values in self.by_run.items()}}
         return simulate_noise_free(self.kind, table, {name: own[name] for name in self.kind.parameters}, effects)
 
@@ -229,7 +213,7 @@ class SystemCase:
 
     stratum: Stratum
     drawn: DrawnSystem
-    effects: tuple[SystemEffect, ...]  # concealed
+    effects: tuple[forms.SystemEffect, ...]  # concealed
     noise: SystemNoise
     noise_text: str  # the line on noise in the simulator file; may be empty
     labels: tuple[str, ...]  # names of the runs, as in the table
@@ -253,7 +237,7 @@ def draw_system_case(seed: int, number: int, *, after_refit: AfterRefit) -> Syst
     """
     stratum, n_earlier = system_stratum_of(number)
     drawing, noising = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number,))).spawn(2)
-    shuffled = [*np.random.default_rng(np.random.SeedSequence(seed)).permutation(FAMILIES), *ADDED_FAMILIES]
+    shuffled = [*np.random.default_rng(np.random.SeedSequence(seed)).permutation(forms.FAMILIES), *forms.ADDED_FAMILIES]
     for attempt in range(_ATTEMPTS):
         family = str(shuffled[(n_earlier + (attempt // 8)) % len(shuffled)])
         drawn = draw_system(KINDS[int(drawing.integers(len(KINDS)))], rng=drawing)
@@ -297,20 +281,20 @@ def draw_system_case(seed: int, number: int, *, after_refit: AfterRefit) -> Syst
 
 def _draw_effects(
     stratum: Stratum, n_earlier: int, family: str, drawn: DrawnSystem, after_refit: AfterRefit, rng: np.random.Generator
-) -> tuple[tuple[SystemEffect, ...], float | None]:
+) -> tuple[tuple[forms.SystemEffect, ...], float | None]:
     """Draw the effects of a stratum once; return them and the cosine of a pair (None: no pair)."""
     if stratum.kind == "clean":
         return (), None
-    forms, name_of, families = forms_of(drawn.true_system), family_of, [family]
+    known, name_of, families = forms.forms_of(drawn.true_system), forms.family_of, [family]
     if stratum.kind == "outside":
-        families = [OUT_OF_VOCABULARY[n_earlier % len(OUT_OF_VOCABULARY)]]
-        forms = list(forms_out_of_vocabulary(drawn.true_system, rng))
+        families = [forms.OUT_OF_VOCABULARY[n_earlier % len(forms.OUT_OF_VOCABULARY)]]
+        known = list(forms.forms_out_of_vocabulary(drawn.true_system, rng))
         name_of = lambda form: form.name.removeprefix("strange_").split(":")[0]
     elif stratum.kind == "pair":
-        families = [str(name) for name in rng.choice(FAMILIES, 2, replace=False)]
+        families = [str(name) for name in rng.choice(forms.FAMILIES, 2, replace=False)]
     chosen = []
     for family in families:
-        if not (own := [form for form in forms if name_of(form) == family]):
+        if not (own := [form for form in known if name_of(form) == family]):
             raise NotConvergedError(f"this system has no target for {family}")
         chosen.append(own[int(rng.integers(len(own)))])
     effects = tuple(draw_effect_of_size(form, stratum.size, drawn, after_refit, rng) for form in chosen)
@@ -327,8 +311,8 @@ def _draw_effects(
 
 
 def draw_effect_of_size(
-    form: Form, wanted: float, drawn: DrawnSystem, after_refit: AfterRefit, rng: np.random.Generator
-) -> SystemEffect:
+    form: forms.Form, wanted: float, drawn: DrawnSystem, after_refit: AfterRefit, rng: np.random.Generator
+) -> forms.SystemEffect:
     """Return an effect of this form with lambda `wanted`, other parameters drawn, without covariates.
 
     Lambda is the norm of its change after a full refit of the model without effects, in noise sds. Raises
@@ -338,7 +322,7 @@ def draw_effect_of_size(
     sign = -1.0 if form.signed and rng.random() < 0.5 else 1.0
 
     def readings_at(amplitude: float) -> FloatArray:
-        return drawn.simulate_diagnosed_rows([SystemEffect(form, form.of_amplitude(sign * amplitude, more))])
+        return drawn.simulate_diagnosed_rows([forms.SystemEffect(form, form.of_amplitude(sign * amplitude, more))])
 
     def size_at(amplitude: float) -> float:
         return float(np.linalg.norm(after_refit(drawn, readings_at(amplitude))))
@@ -351,7 +335,7 @@ def draw_effect_of_size(
     amplitude = amplitude_of_size(
         size_at, wanted, first=first, limit=form.limit, tolerance=_TOLERANCE, acceptable=0.01, max_calls=14
     )
-    return SystemEffect(form, form.of_amplitude(sign * amplitude, more), size_at(amplitude))
+    return forms.SystemEffect(form, form.of_amplitude(sign * amplitude, more), size_at(amplitude))
 
 
 _BINS = 20
@@ -359,7 +343,7 @@ _AS_PLAIN = 0.9  # share of the best covariate's explained variance that counts 
 _PLAIN = 0.25  # least explained share of the sum of squares
 
 
-def _residual_covariates(form: Form, residuals: FloatArray, true: SimulatedSystem) -> tuple[str, ...]:
+def _residual_covariates(form: forms.Form, residuals: FloatArray, true: forms.SimulatedSystem) -> tuple[str, ...]:
     """Return names that a diagnosis may rank first: the form's covariates, then others that explain about as much.
 
     `residuals`: those of the effect after the refit, (n_points,).

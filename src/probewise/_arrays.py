@@ -92,6 +92,12 @@ def frozen_int(values: ArrayLike) -> IntArray:
     return array
 
 
+ROUNDING = 1e-9
+"""Share of a quantity up to which another one differs from it by rounding, of whole models too."""
+
+LAST_DIGITS = 1e-12
+"""The same of a few operations."""
+
 TINY = 1e-300
 """Least divisor, whose square root is a number: what it divides is 0 with it."""
 
@@ -110,7 +116,7 @@ def rounding_error(values: FloatArray, axis: int | None = None) -> FloatArray:
     high = np.max(values, axis=axis, keepdims=kept, initial=-np.inf, where=finite)
     low = np.min(values, axis=axis, keepdims=kept, initial=np.inf, where=finite)
     largest = np.max(np.abs(values), axis=axis, keepdims=kept, initial=0.0, where=finite)
-    return np.asarray(np.maximum(1e-12 * (high - low), 4 * np.spacing(largest)))
+    return np.asarray(np.maximum(LAST_DIGITS * (high - low), 4 * np.spacing(largest)))
 
 
 def distinct_values(values: FloatArray, within: float | None = None) -> FloatArray:
@@ -138,17 +144,12 @@ def require_finite(name: str, values: FloatArray) -> None:
         raise ParameterError(f"{name}[{at}]", float(values.ravel()[at]), "finite numbers")
 
 
-_SAME = 1e-9  # of the largest reading: tolerance between two ways of calling
-
-
 def nearly_equal(first: FloatArray, second: FloatArray) -> bool:
     """Return whether two ways of calling a function give the same readings, up to rounding."""
     if first.shape != second.shape or not np.array_equal(np.isfinite(first), np.isfinite(second)):
         return False
-    there = np.isfinite(first)
-    return bool(
-        np.allclose(first[there], second[there], rtol=_SAME, atol=_SAME * float(np.abs(second[there]).max(initial=0.0)))
-    )
+    one, other = (values[np.isfinite(first)] for values in (first, second))
+    return np.allclose(one, other, rtol=ROUNDING, atol=ROUNDING * float(np.abs(other).max(initial=0.0)))
 
 
 def data_frame(columns: Mapping[str, Any]) -> Any:

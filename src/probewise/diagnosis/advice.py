@@ -16,7 +16,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from scipy.special import logsumexp
 
-from probewise._arrays import TINY, FloatArray, IntArray
+from probewise._arrays import LAST_DIGITS, TINY, FloatArray, IntArray
 from probewise.diagnosis.apparatus import (
     ENOUGH_NATS,
     MOST_ADVISED_READINGS,
@@ -82,11 +82,10 @@ def nats_against(slopes: Sequence[FloatArray], truth: Amounts, rival: Amounts, r
 
 
 ALIAS_COSINE = 0.9
-LAMBDA = 8.0
-"""Size of an effect at which it is detected for certain, and at which a plan is judged."""
+LAMBDA = 8.0  # size of an effect at which it is detected for certain, and at which a plan is judged
 
 LEAST_SHARE = 0.05
-"""Least share of an effect's change of the readings that counts as its own, whatever a fit absorbs."""
+"""Least share that counts: of an effect's change of the readings as its own, of the entropy, of the rivals' weight."""
 
 
 @dataclass(frozen=True)
@@ -199,9 +198,8 @@ def pairs_with_separating_scans(
             needed = int(COUNTS[enough[0]]) if enough.size else MOST_ADVISED_READINGS + 1
             most = float(nats[enough[0] if enough.size else -1])
             if (needed, -most) < best[effects][:2]:
-                asked = replace(
-                    best[effects][2], settle_by=scan.description, readings=min(needed, MOST_ADVISED_READINGS)
-                )
+                readings = min(needed, MOST_ADVISED_READINGS)
+                asked = replace(best[effects][2], settle_by=scan.description, readings=readings)
                 best[effects] = (needed, -most, asked)
     return [alias for _, _, alias in best.values()]
 
@@ -220,13 +218,10 @@ def _collinear_amounts(problem: Linearised, *effects: _Columns) -> list[Amounts]
 
 
 _STRIDES = (2, 4)
-_SETTLED = 0.05  # share of the entropy that may remain
-_LEAST_NOISE_2 = 1e-12  # of the largest variance of a reading
 _WORTHWHILE = 0.03  # least share of the entropy that a further scan must remove
 _ANYTHING = 1e-6  # the same for the first scan
 NO_NAME = "what has no name"
 _NEAR = 0.05  # of a setting's range: how near a planned reading is to a recorded one that it repeats
-_LEAST_WEIGHT = 0.05  # least weight of a rival, since its probability may be wrong
 
 
 @dataclass(frozen=True, eq=False)
@@ -291,7 +286,7 @@ class PredictiveNormal(NamedTuple):
         The noise counts as at least 1e-6 of the largest sd: that of readings that are exact is lost to rounding.
         """
         of_factor = self.factor @ self.factor.T
-        noise_2 = max(1.0, _LEAST_NOISE_2 * float(of_factor.diagonal().max(initial=0.0)))
+        noise_2 = max(1.0, LAST_DIGITS * float(of_factor.diagonal().max(initial=0.0)))
         covariance = noise_2 * np.eye(len(self.mean)) + of_factor
         return covariance, float(np.linalg.slogdet(covariance)[1])
 
@@ -307,7 +302,7 @@ def measurement_separating_rivals(
     leader = max(rivals, key=lambda rival: rival.probability)
     level = leader.model.predict(leader.z[None, :])[0]
     offered = apparatus.candidate_measurements(plan, strides=_STRIDES, level=level)
-    weights = np.maximum([rival.probability for rival in rivals], _LEAST_WEIGHT)
+    weights = np.maximum([rival.probability for rival in rivals], LEAST_SHARE)  # since a probability may be wrong
     weights /= weights.sum()
     if not offered:
         return None
@@ -320,7 +315,7 @@ def measurement_separating_rivals(
     chosen: list[int] = []
     taken: IntArray = np.zeros(0, dtype=np.int64)
     told, uncertain = 0.0, float(-np.sum(weights * np.log(weights)))
-    while uncertain - told > _SETTLED * uncertain:
+    while uncertain - told > LEAST_SHARE * uncertain:
         gains = np.zeros(len(offered))
         for k in range(len(offered)):
             together = np.concatenate([taken, rows[k]])
@@ -434,10 +429,7 @@ def _classes_told_apart(nats: FloatArray, members: Iterable[int]) -> list[list[i
 
 
 def _mean_over_closest(nats: FloatArray, weights: FloatArray) -> float:
-    """Return the log Bayes factor of the truth over its closest rival, averaged by weights (n,); `nats` (n, n).
-
-    Rivals in one class count as one, unless all rivals are in one class.
-    """
+    """Return the log Bayes factor of the truth over its closest rival, averaged by weights (n,); `nats` (n, n)."""
     classes = _classes_told_apart(nats, range(len(nats)))
     others = np.where(np.eye(len(nats), dtype=np.bool_), np.inf, nats)
     for own in classes if len(classes) > 1 else []:

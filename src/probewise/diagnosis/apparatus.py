@@ -34,8 +34,7 @@ ENOUGH_NATS = 3.0
 A noise model, SSF order or proposal that is as far behind the best does not say what to refit next. This may miss
 hypotheses: a refit sometimes gains 8 nats over its screening.
 """
-NOTHING_NATS = 0.5
-"""Expected log Bayes factor below which planned readings do not separate two hypotheses at all."""
+NOTHING_NATS = 0.5  # expected log Bayes factor below which planned readings do not separate two hypotheses at all
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias, cast, get_args
 
 import numpy as np
 
-from probewise._arrays import MOST_NUMBERS, TINY, FloatArray, IntArray, own_arithmetic, read_only_floats
+from probewise._arrays import MOST_NUMBERS, TINY, FloatArray, IntArray, own_arithmetic, read_only_floats, varies
 from probewise._display import Reported
 from probewise._kinds import require_one_of
 from probewise.calibration import FittedSensor
@@ -346,10 +346,7 @@ def audit_plan(
 
 
 def _curing_step_by_effect(steps: Sequence[Sequence[EffectAudit]]) -> dict[str, int]:
-    """Return, for each effect that added scans make fine to the end, the number of scans (1, 2, ...) from which it is.
-
-    `steps` are the audits with 0, 1, 2, ... scans added; scans after the last one that cures do not count.
-    """
+    """Return, for each effect that added scans make fine to the end, the number of scans from which it is."""
     fine = [{effect.name for effect in step if effect.detectability == "fine"} for step in steps]
 
     def fine_since(last: int) -> dict[str, int]:
@@ -420,9 +417,7 @@ _WORTHWHILE_EACH = 0.005  # and per reading: at most 200 readings are spent on o
 _STRIDES = (1, 4)
 
 
-def choose_cure_scans(
-    plan: Plan, expected: Expected, ailing: Sequence[str], progress: Progress = silent
-) -> list[Candidate]:
+def choose_cure_scans(plan: Plan, expected: Expected, ailing: Sequence[str], progress: Progress) -> list[Candidate]:
     """Choose up to five scans to add, one after another, each with the largest reduction of the deficit per reading."""
     every = [*candidate_scans(plan, strides=_STRIDES), *target_swaps(plan)]
     chosen: list[Candidate] = []
@@ -580,7 +575,7 @@ def _point_where_readings_vary(system: System, table: RunTable) -> tuple[FloatAr
     never, is_constant = np.ones(len(table), dtype=np.bool_), False
     for k, z in enumerate(system.starts):
         predicted = system.chain(table, ()).predict(system.theta(z[None, :]), table)[0]
-        if np.isfinite(predicted).all() and np.ptp(predicted) > 1e-12 * max(float(np.abs(predicted).max()), TINY):
+        if np.isfinite(predicted).all() and varies(predicted):
             other = "another point of the prior (at its middle, readings are constant or not finite)"
             return z, predicted, other if k else "the middle of the prior"
         never &= ~np.isfinite(predicted)

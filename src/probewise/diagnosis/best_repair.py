@@ -284,10 +284,7 @@ def improvement_and_correction(
 def _amounts_and_covariance(
     found: Fit, problem: Linearised, columns: FloatArray, kept: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Fit shifts of the parameters, and amplitudes, to the `kept` readings; return means and covariance of both.
-
-    Readings count by their own sd and by what they have in common with others; lost ones do not count.
-    """
+    """Fit shifts of the parameters, and amplitudes, to the `kept` readings; return means and covariance of both."""
     sd, p, law = problem.sd, found.slopes.shape[1], problem.law.take_readings(kept)
     design = law(np.concatenate([found.slopes, columns], axis=1)[kept])
     left = law(found.residuals[kept])

@@ -44,7 +44,6 @@ _STEPS_TRIED = 8  # from each start
 _BEST_STARTS = 3  # of which it goes on
 _BEGINNINGS = 0.25, 0.5  # shares of the longest run that are fitted before all of it
 _CLEARLY = 0.5  # nats of evidence by which another fit is better
-
 _SCREENED, _DESCENTS = 2000, 200  # points of the prior that are predicted, and the best of them, that are followed
 _STAGES = (12, 40), (18, 12), (50, 6), (120, 6)  # steps of all, and the number of the best that go on
 _POLISH, _POLISH_FEW = 400, 25  # steps with central differences, where they cost little, and else
@@ -207,9 +206,8 @@ class _Descent:
         steps = np.where(x > 0.5 * (self.low + self.high), -_DIFFERENCE, _DIFFERENCE) * (10.0 if central else 1.0)
         apart = steps[:, :, None] * np.eye(x.shape[1])
         sides = [x[:, None], x[:, None] + apart, *([x[:, None] - apart] if central else [])]
-        own, up, *down = np.split(
-            self.residuals(np.concatenate(sides, axis=1)), [1, 1 + x.shape[1]][: len(sides) - 1], axis=1
-        )
+        ends = [1, 1 + x.shape[1]][: len(sides) - 1]
+        own, up, *down = np.split(self.residuals(np.concatenate(sides, axis=1)), ends, axis=1)
         with np.errstate(all="ignore"):
             slopes = (down[0] - up) / (2 * steps[:, :, None]) if central else (own - up) / steps[:, :, None]
         residuals = own[:, 0]
@@ -500,9 +498,7 @@ def diagnose_system(
     require_rng(rng)
     require_progress(progress)
 
-    def fit_and_diagnose(
-        simulator: Simulator, *, stiff: bool = False, sought: frozenset[str] | None = None
-    ) -> Diagnosis:
+    def diagnosed(simulator: Simulator, *, stiff: bool = False, sought: frozenset[str] | None = None) -> Diagnosis:
         prepared = prepare_system(simulator, table, source=source, notes=notes, progress=progress, stiff=stiff)
         prepared = replace(prepared, sought=sought)
         told = _progress_with_call_count(progress, cast(SimulatorApparatus, prepared.apparatus).system)
@@ -512,7 +508,7 @@ def diagnose_system(
             searched = replace(search(replace(prepared, effects={}), prior=prior, progress=told), prepared=prepared)
         return diagnose_prepared(prepared, searched=searched, thorough=thorough, progress=told, rng=rng)
 
-    diagnosis = fit_and_diagnose(simulator)
+    diagnosis = diagnosed(simulator)
     needed = finer_step_for_repair(diagnosis)
     if needed is None:
         return diagnosis
@@ -521,7 +517,7 @@ def diagnose_system(
     progress(f"once more, with integration steps of {step:.3g} {simulator.time_unit}, which the repaired law needs")
     # Finer steps cost more, and move evidences by a few nats: a second search of everything is not needed.
     sought = frozenset(n for h in diagnosis.hypotheses if h.probability > _SOUGHT_AGAIN for n in h.effects)
-    return fit_and_diagnose(replace(simulator, law=replace(simulator.law, max_step_s=step)), stiff=stiff, sought=sought)
+    return diagnosed(replace(simulator, law=replace(simulator.law, max_step_s=step)), stiff=stiff, sought=sought)
 
 
 def prepare_system(
@@ -592,10 +588,7 @@ def _progress_with_call_count(progress: Progress, system: System) -> Progress:
 
 
 def notes_on_calls(diagnosis: Diagnosis) -> tuple[str, ...]:
-    """Return notes on calls of a simulator or integration of its law (cut short, failed, interpolated, stiff); else ().
-
-    With those on its declared noise.
-    """
+    """Return notes on calls of a simulator, or the integration of its law, and on its declared noise; else ()."""
     apparatus = diagnosis.apparatus
     if not isinstance(apparatus, SimulatorApparatus):
         return ()

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import log_ndtr, logsumexp
 
-from probewise._arrays import TINY, BoolArray, FloatArray, IntArray
+from probewise._arrays import ROUNDING, TINY, BoolArray, FloatArray, IntArray
 from probewise.diagnosis.fit import Fit, fit, log_multiplicity, residual_degrees_of_freedom, with_prior
 from probewise.diagnosis.noise import (
     LEAST_SCALE,
@@ -33,11 +33,9 @@ from probewise.effects.effect import LEAST_VISIBLE
 from probewise.recordings.plan import Recording
 from probewise.sensor.stages import effects_with_columns
 
-SCALES = np.geomspace(0.05, 25.0, 8)
-"""Prior scales of an effect's rms, in noise sds: a mixture with a heavy tail."""
+SCALES = np.geomspace(0.05, 25.0, 8)  # prior scales of an effect's rms, in noise sds: a mixture with a heavy tail
 
-NUMBERS = 4_000_000
-"""Readings or slopes that are predicted or whitened at once, to fit in memory."""
+NUMBERS = 4_000_000  # readings or slopes that are predicted or whitened at once, to fit in memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,8 +225,7 @@ def _laplace_terms(z: FloatArray, curvature: FloatArray, n_points: int | IntArra
 
 
 _RESOLVED = 0.6  # posterior sd over the distance of nodes, from which their sum is the integral to a percent
-_SAME = 1e-9  # of the prior's unit cube: nodes as close are one
-_EDGE = 1e-6  # of it too
+_EDGE = 1e-6  # of the prior's unit cube
 _ROUNDS = 6
 _REACH = math.sqrt(3)  # of the nodes on both sides of a peak, in posterior sds
 _NODES = _REACH * np.array([0.0, -1.0, 1.0])
@@ -291,9 +288,9 @@ def _coarse_parameters(evidence: NoiseEvidence) -> tuple[IntArray, FloatArray, F
             continue  # without nodes of the prior, or known
         unit = effect.prior.to_unit_cube(settings)
         for k, n in enumerate(effect.nodes_per_parameter):
-            own, node_of = np.unique(np.round(unit[:, k] / _SAME), return_inverse=True)
+            own, node_of = np.unique(np.round(unit[:, k] / ROUNDING), return_inverse=True)
             marginal = np.bincount(node_of.ravel(), weights).astype(np.float64)
-            own = own * _SAME
+            own = own * ROUNDING
             spacing = float(np.diff(own).min(initial=math.inf)) if len(own) > 1 else 1 / n
             mean = float(marginal @ own)
             if math.sqrt(float(marginal @ (own - mean) ** 2)) < _RESOLVED * spacing:
@@ -512,18 +509,13 @@ def linearised_sizes(found: Fit, law: NoiseLaw, usable: IntArray, names: Sequenc
         yield float(np.linalg.norm(np.append(change - rest @ taken, taken)))
 
 
-LEAST_ROWS = 8
-"""Least number of rows of a held-out part."""
-
-MOST_PARTS = 10
-"""Largest number of parts held out in turn."""
+LEAST_ROWS = 8  # least number of rows of a held-out part
+MOST_PARTS = 10  # largest number of parts held out in turn
 
 Parts = tuple[IntArray, tuple[str, ...]]
 """Part number of each usable reading, (n_usable,), -1 for one that is never held out, and the names of the parts."""
 
-N_BLOCKS = 5
-"""Number of parts of readings that have no scans or runs."""
-
+N_BLOCKS = 5  # number of parts of readings that have no scans or runs
 _NO_DENSITY = -690.0  # log density of a reading for which a model predicts no number: that of 1e-300
 _NO_SLOPE = 1e-6  # of a parameter's slope on its own readings: so little on others is rounding of predictions
 _HARDLY_TOLD = 0.5  # variance of a coordinate given the other parts, of 1 before them
@@ -628,12 +620,10 @@ def mean_gain_over_parts(
     if len(long_enough) > MOST_PARTS:
         long_enough = [long_enough[int(i)] for i in np.linspace(0, len(long_enough) - 1, MOST_PARTS).round()]
     gains = [gain(np.asarray(scan == k)) for k in long_enough]
-    by_scan = tuple(
-        (scan_names[k] if scan_names else str(k), float(g.mean())) for k, g in zip(long_enough, gains, strict=True)
-    )
-    joined = np.concatenate(gains)
+    joined, names = np.concatenate(gains), (scan_names[k] if scan_names else str(k) for k in long_enough)
     sd = float(joined.std(ddof=1)) / math.sqrt(len(joined))
-    return HeldOutGain(float(joined.mean()), sd, len(joined), by_scan)
+    by_scan = zip(names, (float(g.mean()) for g in gains), strict=True)
+    return HeldOutGain(float(joined.mean()), sd, len(joined), tuple(by_scan))
 
 
 def predictive_log_densities(

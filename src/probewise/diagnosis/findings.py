@@ -8,7 +8,7 @@ from typing import cast
 
 import numpy as np
 
-from probewise._arrays import FloatArray
+from probewise._arrays import LAST_DIGITS, FloatArray
 from probewise.diagnosis.apparatus import ENOUGH_NATS
 from probewise.diagnosis.best_repair import BestRepair
 from probewise.diagnosis.evidence import held_out_gain, linearised_sizes
@@ -24,8 +24,7 @@ from probewise.effects import Effect, NoiseEffect, is_out_of_vocabulary
 from probewise.effects.effect import mean_and_sd_of_samples, sentence_from_samples
 from probewise.effects.noise import sd_of_rounding
 
-_IS_UNKNOWN = 0.5  # probability of an unknown effect from which effects beside it are listed
-_STANDS_BESIDE = 0.5  # conditional probability from which an effect counts as beside the unknown one
+_LIKELY = 0.5  # probability of an unknown effect from which others beside it count, and of these given that
 
 
 @dataclass(frozen=True)
@@ -86,7 +85,7 @@ def effects_found(
     prepared, out, plan = searched.prepared, [], searched.prepared.everything.plan
     unknown = sum(h.probability for h in hypotheses if h.effects == UNKNOWN)
     beside = {}
-    if unknown >= _IS_UNKNOWN:
+    if unknown >= _LIKELY:
         beside = searched.effect_probabilities_given_unknown() | searched.noise_probabilities_given_unknown()
     unit = plan.instrumentation.unit
     ranked = sorted(searched.posterior.probabilities.items(), key=lambda item: -item[1])
@@ -98,7 +97,7 @@ def effects_found(
 
     for name, effect in prepared.effects.items():
         p = sum(h.probability for h in hypotheses if name in h.effects)
-        if beside.get(name, 0.0) >= _STANDS_BESIDE and not is_out_of_vocabulary(name):
+        if beside.get(name, 0.0) >= _LIKELY and not is_out_of_vocabulary(name):
             p += unknown * beside[name]
         if p <= NEGLIGIBLE or not noise_effects_in_vocabulary((name,)):
             continue
@@ -162,10 +161,7 @@ def _lambda_of(searched: Searched, holder: WeighedFit, name: str, noise: Names) 
 
 
 def noise_found(searched: Searched, best: BestRepair, samples: ModelSamples, *, rng: np.random.Generator) -> NoiseFound:
-    """Describe the noise of the repaired model, and test its residuals for deviations from this noise.
-
-    Deviations are autocorrelation, heavy tails, or a spread that depends on the level.
-    """
+    """Describe the noise of the repaired model, and test its residuals for deviations from this noise."""
     prepared, after = searched.prepared, best.problem
     steps, usable = n_rows_since_previous_usable(prepared.recording), previous_usable(prepared.recording)
     own = after.residual[: after.n_points, None]
@@ -173,7 +169,7 @@ def noise_found(searched: Searched, best: BestRepair, samples: ModelSamples, *, 
     previous, level = np.where(steps == 1, usable, -1), best.fit.found.predicted
     joined = noise_statistics(np.concatenate([own, null], axis=1), previous, level)
     center, spread = joined[:, 1:].mean(axis=1), joined[:, 1:].std(axis=1)
-    worst = np.max(np.abs(joined - center[:, None]) / np.maximum(spread, 1e-12)[:, None], axis=0)
+    worst = np.max(np.abs(joined - center[:, None]) / np.maximum(spread, LAST_DIGITS)[:, None], axis=0)
     p_value = (1 + int(np.sum(worst[1:] >= worst[0]))) / (1 + N_DRAWS)
     unit = prepared.recording.plan.instrumentation.unit
     parameters = [_parameter_found("sd", unit, samples.noise_sd)]
@@ -276,7 +272,7 @@ def _formula_beside(
     parts, own = searched.prepared.apparatus.held_out_parts(recording), best.fit.evidence[best.noise]
     held = held_out_gain(best.fit.found, fit.found, recording, law, parts, law_of_null=own.likeliest_law)
     unit, gained = recording.plan.instrumentation.unit, fit.evidence[best.noise].log_z - own.log_z
-    formula = _formula_from_samples(effect, values, unit, gained, held.per_reading)
+    formula = _formula_of(effect, values, unit, gained, held.per_reading)
     return formula, f"; a formula describes it: {sentence_from_samples(effect, values)}"
 
 
@@ -307,12 +303,10 @@ def formula_of(searched: Searched, judged: Judged, best: BestRepair, samples: Mo
     for effect in best.fit.found.model.effects:
         if effect.expression and is_out_of_vocabulary(effect.name):
             values = samples.effect_samples(effect.name)
-            return _formula_from_samples(effect, values, unit, gain.log_evidence, gain.heldout_log_density_per_reading)
+            return _formula_of(effect, values, unit, gain.log_evidence, gain.heldout_log_density_per_reading)
     return None
 
 
-def _formula_from_samples(
-    effect: Effect, values: FloatArray, unit: str, log_evidence: float, per_reading: float
-) -> Formula:
+def _formula_of(effect: Effect, values: FloatArray, unit: str, log_evidence: float, per_reading: float) -> Formula:
     _, side, target, _ = effect.name.split(":", 3)
     return Formula(effect.expression, side, target, parameters_found(effect, values, unit), log_evidence, per_reading)

@@ -20,8 +20,7 @@ from probewise.recordings.plan import Plan, Recording
 from probewise.sensor import FAST_NODES, AnyEffect
 from probewise.sensor.stages import effects_with_columns
 
-FARTHEST = 6.0
-"""Bound of every coordinate: six standard deviations of its prior."""
+FARTHEST = 6.0  # bound of every coordinate: six standard deviations of its prior
 
 
 class Predictor(Protocol):
@@ -139,12 +138,8 @@ def effect_coordinates(effect: Effect, values: FloatArray) -> FloatArray:
     return np.clip(ndtri(effect.prior.to_unit_cube(values)), -FARTHEST + 0.5, FARTHEST - 0.5)
 
 
-DIFFERENCE = 1e-5
-"""Step of a coordinate for forward differences: predictions are smooth to about 1e-12."""
-
-AT_ONCE = 300_000
-"""Predictions per batch, to fit a processor's cache."""
-
+DIFFERENCE = 1e-5  # step of a coordinate for forward differences: predictions are smooth to about 1e-12
+AT_ONCE = 300_000  # predictions per batch, to fit a processor's cache
 _AS_EXPECTED = 0.5  # of the gain to second order, from which a step without damping is taken without trying others
 _FARTHEST_CHANGE = 1e6  # in largest predictions: beyond it squares overflow, and a law without the effect has run away
 _IMPOSSIBLE_CHANGE = 1e3  # least change, in noise sds, of a row whose reading is impossible without the effect

@@ -235,7 +235,7 @@ def fit_simulator(
     fitted = fitted_system_from_samples(about, samples, recording, mean)
     fitted = replace(fitted, best=tuple(system.theta(modes[:1])[0].tolist()))
     evidence = Evidence(draws.log_z, max(draws.log_z_error, _LEAST_ERROR), "importance sampling")
-    beside = _nested_sampling(problem, z, rng=rng, progress=progress) if thorough else None
+    beside = _nested(problem, z, rng=rng, progress=progress) if thorough else None
     return SystemFit(recording, fitted, evidence, mean, sd, beside)
 
 
@@ -273,9 +273,7 @@ def _doubts(
         )
 
 
-def _nested_sampling(
-    problem: HypothesisProblem, z: FloatArray, *, rng: np.random.Generator, progress: Progress
-) -> Evidence:
+def _nested(problem: HypothesisProblem, z: FloatArray, *, rng: np.random.Generator, progress: Progress) -> Evidence:
     """Compute the evidence by nested sampling; of a law, from a prior near the samples, which takes fewer calls."""
     method, target = "nested sampling", cast(nested.Samplable, problem)
     if problem.model.sensor.predicts_dearly:

@@ -16,7 +16,7 @@ from typing import NamedTuple, cast
 import numpy as np
 from scipy.special import ndtr
 
-from probewise._arrays import FloatArray, IntArray
+from probewise._arrays import ROUNDING, FloatArray, IntArray
 from probewise.diagnosis.apparatus import MOST_ADVISED_READINGS, Apparatus, Candidate, Words
 from probewise.diagnosis.evidence import LEAST_ROWS, MOST_PARTS, Parts
 from probewise.diagnosis.fit import Fit, Null
@@ -316,7 +316,7 @@ def _place_covariates_along_scans(plan: Plan, usable: IntArray) -> list[Covariat
 
 
 def _varies(values: FloatArray, size: float = 0.0) -> bool:
-    return values.size > 1 and float(np.ptp(values)) > 1e-9 * max(size, float(np.abs(values).max()))
+    return values.size > 1 and float(np.ptp(values)) > ROUNDING * max(size, float(np.abs(values).max()))
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.linalg.lapack import dpbtrf, dpttrf, dpttrs, dtbtrs
 from scipy.special import expit
 
-from probewise._arrays import TINY, BoolArray, FloatArray, IntArray
+from probewise._arrays import LAST_DIGITS, ROUNDING, TINY, BoolArray, FloatArray, IntArray
 from probewise.effects import NoiseEffect
 from probewise.effects.noise import FAR, SD_FACTORS, lattice_step, sd_of_rounding
 from probewise.effects.noise_distribution import FittedReadings, log_gaussian_mass_between
@@ -24,17 +24,13 @@ from probewise.inference import sd_of_numbers
 from probewise.recordings.plan import Recording
 from probewise.sensor.stages import NoiseParameters, effects_with_columns
 
-MAD_OF_NORMAL = 0.6745
-"""Median absolute deviation of a standard normal, by which a robust sd is estimated."""
+MAD_OF_NORMAL = 0.6745  # median absolute deviation of a standard normal, by which a robust sd is estimated
 
 SAME_SD = 0.03
 """Share by which two noise sds may differ and count as equal: weights that differ so little hardly move a fit."""
 
-RUNS_AWAY = 1e100
-"""Prediction or residual whose square overflows: it counts as impossible."""
-
-LEAST_SCALE = 1e-150
-"""Least sd, for readings that are exactly as predicted."""
+RUNS_AWAY = 1e100  # prediction or residual whose square overflows: it counts as impossible
+LEAST_SCALE = 1e-150  # least sd, for readings that are exactly as predicted
 
 _LOG_ROOT_2_PI = 0.5 * math.log(2 * math.pi)
 _EM_STEPS = 12
@@ -98,10 +94,7 @@ class Tail:
         return np.asarray(whitened * self._relative_precisions((whitened / sigma) ** 2) / self.fisher_information)
 
     def log_sigma_curvature(self, whitened: FloatArray, sigma: FloatArray, n_points: int) -> FloatArray:
-        """Return minus the second derivative of the log likelihood by log sigma at its peak sigma, (k,).
-
-        The result is at least 0.2 per reading.
-        """
+        """Return minus the second derivative of the log likelihood by log sigma at its peak sigma, (k,), or a least."""
         squares = (whitened / sigma) ** 2
         wide = self.wide_probability(squares)
         less = (1 - np.asarray(self.times) ** -2) ** 2 * np.sum(squares**2 * wide * (1 - wide), axis=0)
@@ -547,7 +540,6 @@ def _precision_bands_of_walk(law: NoiseLaw) -> FloatArray:
 
 _ROUNDS = 20
 _SAME = 0.01  # change of a reading's relative precision, and of sigma, at which the rounds end
-_SMALLEST = 1e-9  # sigma, of the largest residual: most readings may be exactly as predicted
 
 
 def with_known_wide_readings(laws: Sequence[NoiseLaw], residuals: FloatArray) -> list[NoiseLaw]:
@@ -571,7 +563,7 @@ def with_known_wide_readings(laws: Sequence[NoiseLaw], residuals: FloatArray) ->
         # Of all distributions at once: between their blocks the bands are 0.
         flat = np.concatenate(list(bands), axis=1), weight.ravel(), np.tile(residuals, len(own))
         smoothed, variance = (values.reshape(own.shape) for values in _smoothed_and_variance(*flat))
-        unshared = np.maximum(1 - weight * variance, 1e-12)
+        unshared = np.maximum(1 - weight * variance, LAST_DIGITS)
         apart, beside = (residuals - smoothed) / unshared, variance / unshared  # from the walk as the others tell it
         last = sigma
         if k:
@@ -580,7 +572,7 @@ def with_known_wide_readings(laws: Sequence[NoiseLaw], residuals: FloatArray) ->
         else:  # whatever some outlying readings are
             sizes = np.abs(apart / np.sqrt(beside + own))
             sigma = np.array([np.median(a[b]) for a, b in zip(sizes, kept, strict=True)]) / MAD_OF_NORMAL
-        sigma = np.maximum(np.maximum(sigma, floor), _SMALLEST * np.abs(apart).max(axis=1))
+        sigma = np.maximum(np.maximum(sigma, floor), ROUNDING * np.abs(apart).max(axis=1))
         apart /= sigma[:, None]
         log_narrow = np.log1p(-share) + _log_normal_density(apart, beside + own)
         log_wide = np.log(share) + _log_normal_density(apart, beside + own * wider)
@@ -608,10 +600,8 @@ def with_known_wide_readings(laws: Sequence[NoiseLaw], residuals: FloatArray) ->
     return out
 
 
-def _smoothed_and_variance(
-    steps: FloatArray, weight: FloatArray, residuals: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return the expected walk and its variance, in units of sigma^2, given all residuals: (n_points,) both.
+def _smoothed_and_variance(steps: FloatArray, weight: FloatArray, seen: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the expected walk and its variance, in units of sigma^2, given all residuals `seen`: (n_points,) both.
 
     `steps` are the bands of the walk's precision, (2, n_points); `weight` the precisions of the readings, (n_points,).
     """
@@ -621,7 +611,7 @@ def _smoothed_and_variance(
     backwards, _, _ = dpttrf(diagonal[::-1], below[::-1])
     if failed:
         raise np.linalg.LinAlgError("the precision of a random walk is not definite")
-    smoothed, _ = dpttrs(forwards, lower, weight * residuals)
+    smoothed, _ = dpttrs(forwards, lower, weight * seen)
     return np.asarray(smoothed), np.asarray(1 / (forwards + backwards[::-1] - diagonal))
 
 
@@ -844,7 +834,7 @@ class NoiseModel:
     def _lost_readings(self, share: float, value: float, far: BoolArray) -> tuple[BoolArray, float]:
         """Return the mask of the readings lost to a value, (n_usable,), and their log probability."""
         span, resolution = self._span_and_resolution
-        lost = far & (np.abs(self._readings - value) <= 1e-9 * span + 1e-14 * abs(value))
+        lost = far & (np.abs(self._readings - value) <= ROUNDING * span + 1e-14 * abs(value))
         n_lost, cells = int(lost.sum()), max(span / resolution, 1.0)
         # A lost reading has a density, 1 / cell; a censored one has a probability, so the cell cancels.
         log_extra = n_lost * math.log(share / resolution)
@@ -871,7 +861,7 @@ class NoiseModel:
     @cached_property
     def _span_and_resolution(self) -> tuple[float, float]:
         """Span of the readings, and to what a lost reading's value is known."""
-        return float(np.ptp(self._readings)), self._rounding_step or _FINE * rough_sd(self.recording) or 1e-12
+        return float(np.ptp(self._readings)), self._rounding_step or _FINE * rough_sd(self.recording) or LAST_DIGITS
 
     @cached_property
     def _rows_before(self) -> tuple[IntArray, IntArray, IntArray]:
@@ -894,7 +884,7 @@ def log_prior_of_lost_value(value: float, cells: float, ends: Sequence[float]) -
     """
     if not ends:
         return -math.log(cells)
-    at_end = any(abs(value - end) <= 1e-9 * (max(ends) - min(ends) + abs(end)) for end in ends)
+    at_end = any(abs(value - end) <= ROUNDING * (max(ends) - min(ends) + abs(end)) for end in ends)
     return math.log(0.5 * at_end / len(ends) + 0.5 / cells)
 
 

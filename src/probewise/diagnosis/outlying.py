@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import betaln, ndtri, stdtr
 
-from probewise._arrays import TINY, BoolArray, FloatArray, IntArray
+from probewise._arrays import ROUNDING, TINY, BoolArray, FloatArray, IntArray
 from probewise._words import count_with_noun
 from probewise.diagnosis.fit import Fit, Model, fit, fit_each_start, with_prior
 from probewise.diagnosis.locate import Covariate, window_columns
@@ -28,9 +28,7 @@ from probewise.priors import Uniform
 from probewise.recordings.plan import Recording
 from probewise.sensor.stages import Stage
 
-FAR_OUT = ", far out"
-"""Suffix of the names of families of unknown effects in which outlying readings cluster."""
-
+FAR_OUT = ", far out"  # suffix of the names of families of unknown effects in which outlying readings cluster
 _BY_CHANCE = 0.05  # probability that noise alone has such a reading in a recording
 _CLUSTERED = 3.0  # nats for a share of outlying readings that depends on a covariate
 _NO_CHANCE = 1e-6  # the same, of a reading of which a note is worth while
@@ -118,7 +116,7 @@ def improbable_rows(found: Fit, law: NoiseLaw, *, chance: float = _BY_CHANCE) ->
             free = int(kept.sum()) - slopes.shape[1] - 1
             if free < 2:
                 break
-            unshared = 1 - np.minimum(np.sum(own**2, axis=1), 1 - 1e-9)
+            unshared = 1 - np.minimum(np.sum(own**2, axis=1), 1 - ROUNDING)
             others = (left @ left - left**2 / unshared) / free
             t = np.abs(left) / np.sqrt(np.maximum(others, TINY) * unshared)
             t[unshared < 1e-6] = 0.0
@@ -213,10 +211,7 @@ def _farthest(residual: FloatArray, n: int, law: NoiseLaw) -> BoolArray:
 
 
 def _beyond_neighbours(residual: FloatArray, run: IntArray, aside: BoolArray) -> FloatArray:
-    """Return by how much each residual exceeds both nearest ones in its run that are not `aside`, or the only one.
-
-    The result is 0 where it lies between them, (n_points,).
-    """
+    """Return by how much each residual exceeds both nearest ones in its run that are not `aside`, or the only one."""
     order = np.argsort(run, kind="stable")
     r, last = residual[order], run[order]
     number = np.arange(len(r))
@@ -295,7 +290,7 @@ class MeterStop:
     @property
     def effect(self) -> NoiseEffect:
         """The stop as an effect, whose level is certain to within rounding."""
-        near = 1e-9 * (1 + abs(self.level))
+        near = ROUNDING * (1 + abs(self.level))
         way, beyond = ("rises", np.maximum) if self.is_ceiling else ("falls", np.minimum)
         says = f"{self.reading} {way} no further than {self.level:.6g} {self.unit}".rstrip()
         prior = {"level": Uniform(self.level - near, self.level + near)}

@@ -33,7 +33,7 @@ from typing import TypeAlias, cast
 import numpy as np
 from scipy.special import logsumexp, ndtr, ndtri
 
-from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise._arrays import LAST_DIGITS, BoolArray, FloatArray, IntArray
 from probewise.diagnosis.evidence import NUMBERS, NoiseEvidence, log_evidence_of
 from probewise.diagnosis.fit import FARTHEST, Fit, Model, difference_points_and_steps, fit, fit_each_start, with_prior
 from probewise.diagnosis.noise import LEAST_SCALE, RUNS_AWAY, NoiseLaw, SdPrior
@@ -60,7 +60,6 @@ from probewise.systems import System
 _STRAIGHT = 0.2  # sd of a coordinate within which its value is as good as linear in it
 _SWEEPS = 10
 _STEP = 1e-6  # of a coordinate, for central differences of priors
-_INDEFINITE = 1e-12  # of the curvature, by which that of readings fitted exactly may fail to be positive
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +124,7 @@ def draws_of_linear_amplitudes(
             component = np.argmax(log_weight + rng.gumbel(size=log_weight.shape), axis=1)
             precision[:, group.at] = group.sds[component, None] ** -2
         every = np.repeat(curvature[None], n_samples, axis=0)
-        every[:, own, own] += precision + _INDEFINITE * np.diag(curvature)
+        every[:, own, own] += precision + LAST_DIGITS * np.diag(curvature)
         # Of the mean plus a draw of covariance 1 / every: one solution with a right side of covariance `every`.
         noise = np.einsum("nij,nj->ni", np.linalg.cholesky(every), rng.standard_normal(drawn.shape))
         drawn = np.linalg.solve(every, (downhill + noise)[:, :, None])[:, :, 0]
@@ -400,9 +399,8 @@ class _Kernels:
 
     def log_density(self, z: FloatArray) -> FloatArray:
         n_params, nu = z.shape[1], self.degrees_of_freedom
-        norm = (
-            student_t_log_norm(n_params, nu) + np.log(self.share) + np.log(np.einsum("kpp->kp", self.lower)).sum(axis=1)
-        )
+        norm = student_t_log_norm(n_params, nu) + np.log(self.share)
+        norm = norm + np.log(np.einsum("kpp->kp", self.lower)).sum(axis=1)
         blocks = np.array_split(z, max(len(z) * self.mean.size // NUMBERS, 1))
         squares = (np.sum(((block - self.mean[:, None]) @ self.lower) ** 2, axis=2) for block in blocks)
         each = (norm[:, None] - 0.5 * (nu + n_params) * np.log1p(square / nu) for square in squares)

@@ -283,10 +283,7 @@ class Prepared:
 
     @property
     def has_too_little_data(self) -> bool:
-        """Whether the readings are too few for a verdict, or all equal; those at an end of the range do not count.
-
-        Those left out as lost do: which they are, the others tell.
-        """
+        """Whether the readings are too few for a verdict, or all equal; those at an end of the range do not count."""
         n_informative = len(self.usable_rows) - int(self.recording.censored[self.usable_rows].sum())
         n_informative += len(self.recording.left_out)
         return n_informative < self.least_readings or self.has_only_equal_readings

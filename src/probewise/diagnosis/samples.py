@@ -15,7 +15,7 @@ from typing import cast
 import numpy as np
 from scipy.special import logsumexp
 
-from probewise._arrays import BoolArray, FloatArray, IntArray, read_only_floats, rounding_error
+from probewise._arrays import LAST_DIGITS, BoolArray, FloatArray, IntArray, read_only_floats, rounding_error
 from probewise.calibration.fields import (
     choose_pixel_mm,
     gaussians_sorted_by_mass,
@@ -114,9 +114,8 @@ class ModelSamples:
         pixel_mm = choose_pixel_mm(theta, self.n_gaussians, step_mm=step_mm)
         residuals = recording.readings[usable] - self.chain.predict(self.theta[:50], plan)[:, usable]
         low, high = sd_floor(recording), sd_ceiling(recording)
-        scan_noise = noise_by_scan(
-            residuals, plan.scan[usable], plan.scan_names, sd_floor=low, sd_ceiling=high, rng=rng
-        )
+        scans = plan.scan[usable], plan.scan_names
+        scan_noise = noise_by_scan(residuals, *scans, sd_floor=low, sd_ceiling=high, rng=rng)
         return FittedSensor(
             names=tuple(self.chain.names[i] for i in kept),
             samples=theta[:, kept],
@@ -164,7 +163,7 @@ def sample_model(
     residuals = np.resize(readings - predicted, (N_SAMPLES, len(usable)))
     noise_sd = draw_noise_sd(law, residuals, rng=rng)
     largest = float(np.abs(readings).max()) or 1.0
-    noise_sd = np.maximum(noise_sd, found.sd * 1e-6 + largest * 1e-12)
+    noise_sd = np.maximum(noise_sd, found.sd * 1e-6 + largest * LAST_DIGITS)
     on_noise = [effect for effect in noise.noise.effects if effect.name not in NUISANCES]
     chain = null.chain(recording.plan, (*model.effects, *on_noise), n_nodes=ACCURATE_NODES)
     own = {}

@@ -45,8 +45,7 @@ from probewise.sensor import (
     mixture_parameter_names,
 )
 
-LEAST_READINGS = 24
-"""Fewest usable readings for a verdict on a sensor."""
+LEAST_READINGS = 24  # fewest usable readings for a verdict on a sensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,9 +111,8 @@ class CalibratedSensor:
 
     def z(self, theta: FloatArray) -> FloatArray:
         """Invert `theta`."""
-        return self._z_from_natural(
-            theta_to_free_form(theta) if self.is_free_form else theta_to_natural(theta, self.n_gaussians)
-        )
+        natural = theta_to_free_form(theta) if self.is_free_form else theta_to_natural(theta, self.n_gaussians)
+        return self._z_from_natural(natural)
 
     def _natural_from_z(self, z: FloatArray) -> FloatArray:
         return self.center + z @ self.factor.T
@@ -303,7 +301,7 @@ class SensorAndShape(CalibratedSensor):
         require(recording.usable.any(), "usable readings", 0, "at least one; the recording holds none")
         known = sensor_from_samples(sensor)
         members = tuple(shape.shapes.values()) if isinstance(shape, AnyOf) else (shape,)
-        found = [_search_for_shapes(cls.over(known, member, np.empty((0, 0))), recording, rng) for member in members]
+        found = [_search_shapes(cls.over(known, member, np.empty((0, 0))), recording, rng) for member in members]
         best = min(range(len(members)), key=lambda k: found[k][0])
         return cls.over(known, members[best], found[best][1])
 
@@ -348,9 +346,7 @@ class _ShapeAmongPatterns(HypothesisScene):
 _N_DRAWS, _N_ELITE, _N_ROUNDS = 2000, 40, 8
 
 
-def _search_for_shapes(
-    null: SensorAndShape, recording: Recording, rng: np.random.Generator
-) -> tuple[float, FloatArray]:
+def _search_shapes(null: SensorAndShape, recording: Recording, rng: np.random.Generator) -> tuple[float, FloatArray]:
     """Search for shapes that fit the readings, with the sensor at its prior mean.
 
     Shapes are drawn from the prior, then repeatedly about the best ones. Returns the least sum of squares, and the

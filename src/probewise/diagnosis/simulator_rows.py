@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from probewise._arrays import TINY, FloatArray, IntArray
+from probewise._arrays import LAST_DIGITS, TINY, FloatArray, IntArray
 from probewise.diagnosis.apparatus import MOST_ADVISED_READINGS, Apparatus, Candidate, PriorOdds, Words
 from probewise.diagnosis.evidence import LEAST_ROWS, N_BLOCKS, Parts
 from probewise.diagnosis.fit import Fit, Model, Null
@@ -156,7 +156,6 @@ CALLS_OF_A_SEARCH = 8_000  # with what judging and sampling ask beyond it, some 
 # table as of a short one.
 _EVALUATIONS_PER_ROW = 6_000
 _LEAST_EVALUATIONS = 1_500_000
-_CONSTANT = 1e-12  # of a covariate's largest value: a range up to this is rounding
 _MOST_MULTIPLIED = 10  # factors of products, time included: 45 products; more would dilute the prior of each
 
 # Of a term in a rate that is another state by definition, such as that of a position; of a jump at a row of a table
@@ -276,7 +275,7 @@ class SimulatorApparatus(Apparatus):
         out = []
         for name, values in pooled.items():
             there = np.flatnonzero(np.isfinite(values))
-            if there.size > 1 and np.ptp(values[there]) > _CONSTANT * max(TINY, float(np.abs(values[there]).max())):
+            if there.size > 1 and np.ptp(values[there]) > LAST_DIGITS * max(TINY, float(np.abs(values[there]).max())):
                 out.append(Covariate(name, values[there], there))
         if len(table.scan_names) > 1:
             out.append(Covariate("run", table.scan[usable].astype(np.float64), np.arange(len(usable)), groups=True))

@@ -17,7 +17,7 @@ from typing import cast
 
 import numpy as np
 
-from probewise._arrays import TINY, BoolArray, FloatArray, IntArray
+from probewise._arrays import LAST_DIGITS, ROUNDING, TINY, BoolArray, FloatArray, IntArray
 from probewise.diagnosis.evidence import SCALES, Linearised, scale_and_project
 from probewise.diagnosis.fit import AT_ONCE, Fit, effect_values
 from probewise.diagnosis.noise import NoiseLaw
@@ -28,7 +28,6 @@ from probewise.effects.reference import scan_indicator
 from probewise.sensor import Stage
 
 _INVISIBLE = -50.0  # log Bayes factor of a template that the fit absorbs entirely
-_ABSENT = 1e-9  # share of a template's squares below which its projection is rounding
 _MOST_AT_ONCE = 2**19  # numbers of templates that are multiplied together, for a processor's cache
 _MOST_REMEMBERED = 2**25  # numbers of templates that are remembered: those of a few hundred rows about every fit
 _MOST_PASSING = 2**22  # numbers of templates that are not remembered
@@ -210,10 +209,8 @@ def _gram_eigensystems(squares: FloatArray) -> tuple[FloatArray, FloatArray]:
     first, second, both = squares[:, 0, 0], squares[:, 1, 1], squares[:, 0, 1]
     angle = 0.5 * np.arctan2(2 * both, first - second)
     c, s = np.cos(angle), np.sin(angle)
-    values = np.stack(
-        [first * c * c + second * s * s + 2 * both * c * s, first * s * s + second * c * c - 2 * both * c * s]
-    )
-    return values.T, np.stack([np.stack([c, s], axis=1), np.stack([-s, c], axis=1)], axis=2)
+    both_ways = first * c * c + second * s * s + 2 * both * c * s, first * s * s + second * c * c - 2 * both * c * s
+    return np.stack(both_ways).T, np.stack([np.stack([c, s], axis=1), np.stack([-s, c], axis=1)], axis=2)
 
 
 def _log_bayes_factors_of_grams(grams: FloatArray, along: FloatArray, total: FloatArray, n_kept: int) -> FloatArray:
@@ -229,7 +226,7 @@ def _log_bayes_factors_of_grams(grams: FloatArray, along: FloatArray, total: Flo
     (n, width, n_draws); `total`: sums of squares of the residuals, (n_draws,).
     """
     gain, axes = _gram_eigensystems(grams)
-    gain = np.where(gain > _ABSENT * n_kept, gain, 0.0)
+    gain = np.where(gain > ROUNDING * n_kept, gain, 0.0)
     turned = axes.transpose(0, 2, 1) @ along
     explained = turned**2 / np.where(gain > 0, gain, np.inf)[:, :, None] / total
     terms = np.empty((len(SCALES), len(gain), len(total)))
@@ -237,7 +234,7 @@ def _log_bayes_factors_of_grams(grams: FloatArray, along: FloatArray, total: Flo
     for k, scale in enumerate(SCALES):
         ratio = scale**2 * gain
         of_all = np.einsum("bwd,bw->bd", explained, ratio / (1 + ratio))
-        np.log1p(-np.minimum(of_all, 1 - 1e-12), out=terms[k])
+        np.log1p(-np.minimum(of_all, 1 - LAST_DIGITS), out=terms[k])
         terms[k] *= -0.5 * n_kept
         terms[k] -= 0.5 * np.log1p(ratio).sum(axis=1)[:, None]
     terms[~visible] = _INVISIBLE
@@ -247,9 +244,8 @@ def _log_bayes_factors_of_grams(grams: FloatArray, along: FloatArray, total: Flo
 
 
 _RUNS_AWAY = 1e9  # times the largest prediction: such a model has diverged, and its derivative is meaningless
-_ROUNDING = 1e-9  # of the largest prediction: a smaller change counts as none if it is insignificant,
-_LAST_DIGITS = 1e-12  # or, whatever the noise, no larger than rounding of predictions that are smooth to this share
-_INSIGNIFICANT = 0.01  # noise sds; readings by the epoch vary by less than `_ROUNDING`
+# Noise sds: a smaller change that is rounding, of predictions that may be by the epoch, counts as none.
+_INSIGNIFICANT = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -316,7 +312,7 @@ class TemplateCache:
     def templates_of(self, found: Fit, effect: Effect) -> EffectTemplates:
         """Return the templates of one effect about one fit; those of more variants than a bank has are not kept."""
         known = self._keep(found)
-        own = known.get(effect) or self._shared_with_first_copy(known, effect)
+        own = known.get(effect) or self._shared_with_first(known, effect)
         return own or templates_of_effect(found, effect, self.usable)
 
     def _keep(self, found: Fit) -> dict[Effect, EffectTemplates]:
@@ -329,9 +325,7 @@ class TemplateCache:
             self.banks = {key: bank for key, bank in self.banks.items() if key[0] is not forgotten}
         return self.known[found]
 
-    def _shared_with_first_copy(
-        self, known: Mapping[Effect, EffectTemplates], effect: Effect
-    ) -> EffectTemplates | None:
+    def _shared_with_first(self, known: Mapping[Effect, EffectTemplates], effect: Effect) -> EffectTemplates | None:
         """Return the templates of a second copy of an effect where those of the first are known and hold them all."""
         name = name_of_first_copy(effect.name)
         first = next((own for e, own in known.items() if e.name == name), None)
@@ -373,10 +367,7 @@ def templates_of_effect(found: Fit, effect: Effect, usable: IntArray, *, most: i
 
 
 def _predicted_changes(found: Fit, effect: Effect, bank: FloatArray, usable: IntArray) -> list[FloatArray]:
-    """Return the change of the readings by each entry of a bank, (n_usable, n_columns), 0 outside the effect's scans.
-
-    A column is 0 too if the model with the effect diverges, or the change is no more than rounding.
-    """
+    """Return the change of the readings by each entry, (n_usable, n_columns); 0 if it is rounding, or diverges."""
     plain, plan = found.model, found.model.plan
     model = plain.with_effect(effect)
     n_rows = bank.shape[0] * bank.shape[1]
@@ -404,7 +395,7 @@ def _predicted_changes(found: Fit, effect: Effect, bank: FloatArray, usable: Int
             read = model.chain.readings_from_simulated_view(seen, theta, there)
         change[rows, kept] = (read if len(at) == len(there) else read[:, at]) - found.predicted[kept]
     size, largest = np.maximum(change.max(axis=1), -change.min(axis=1)), np.abs(found.predicted).max(initial=0.0)
-    none = min(_ROUNDING * largest, max(_INSIGNIFICANT * found.sd, _LAST_DIGITS * largest))
+    none = min(ROUNDING * largest, max(_INSIGNIFICANT * found.sd, LAST_DIGITS * largest))
     change[~((size >= none) & (size < _RUNS_AWAY * (1 + largest)))] = 0.0  # NaN too
     return np.split(change.T, len(bank), axis=1)
 

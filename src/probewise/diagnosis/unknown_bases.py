@@ -22,15 +22,9 @@ from probewise.diagnosis.evidence import Linearised, OrthonormalBlocks
 from probewise.diagnosis.locate import Covariate
 from probewise.diagnosis.templates import TemplateBank
 
-PRODUCTS = "products of two columns"
-"""The family of products of covariates."""
-
-MEMORY = "what was seen before"
-"""The family of what a reading keeps of earlier ones."""
-
-SCAN_ENDS = "ends of scans"
-"""The family of transients at the ends of scans or runs."""
-
+PRODUCTS = "products of two columns"  # the family of products of covariates
+MEMORY = "what was seen before"  # the family of what a reading keeps of earlier ones
+SCAN_ENDS = "ends of scans"  # the family of transients at the ends of scans or runs
 _LIKE = 0.9  # cosine from which a basis duplicates a named effect
 _ROUNDING = 1e-13  # of a template's squares: a direction of which the fit leaves no more is absorbed
 _MOST_GROUPS = 24
@@ -214,10 +208,7 @@ def _memory_bases(signal: FloatArray, starts: IntArray) -> Iterator[FloatArray]:
 
 
 def _scan_end_bases(n_points: int, starts: IntArray) -> Iterator[FloatArray]:
-    """Yield pairs of columns: decay from a scan's start, growth towards its end, over 2 and over 8 readings.
-
-    A pair is the same in all scans; with up to 24 scans, there are also bases of one pair per scan.
-    """
+    """Yield pairs of columns: decay from a scan's start, growth towards its end, over 2 and over 8 readings."""
     n_rows, rows = np.diff(starts, append=n_points), np.arange(n_points)
     first, last = np.repeat(starts, n_rows), np.repeat(starts + n_rows - 1, n_rows)
     each = (first[:, None] == starts).astype(np.float64)

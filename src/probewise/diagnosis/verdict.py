@@ -36,11 +36,8 @@ from probewise.diagnosis.words import (
 )
 from probewise.effects import PROPOSAL, NoiseEffect
 
-N_DRAWS = 999
-"""Number of residual draws under the null."""
-
-NEGLIGIBLE = 1e-3
-"""Probability up to which a hypothesis or an effect is not listed."""
+N_DRAWS = 999  # number of residual draws under the null
+NEGLIGIBLE = 1e-3  # probability up to which a hypothesis or an effect is not listed
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,8 +246,7 @@ def hypotheses_with_verdict(
     rare = decided_rare_effects(searched.leading_combination_out_of_vocabulary(), unknown) if p_value <= ALARM else ()
     if rare:
         hypotheses = ranked_hypotheses(
-            posterior.probabilities,
-            lambda mean: mean if effects_out_of_vocabulary(mean) == rare else reported_as(mean),
+            posterior.probabilities, lambda mean: mean if effects_out_of_vocabulary(mean) == rare else reported_as(mean)
         )
         verdict, combination = verdict_on(hypotheses)
         if verdict == "named" and {*rare} <= {*combination}:
@@ -301,10 +297,8 @@ def with_shared_effects(
     return replace(judged, verdict="named", combination=tuple(sorted({*shared, *likely})), leader=leader)
 
 
-def _leader_on_mean(
-    probability: Mapping[Names, float], noise_names: frozenset[str], aliases: tuple[Alias, ...]
-) -> Names:
-    physics = {k: p for k, p in probability.items() if k != UNKNOWN and not {*k} <= noise_names}
+def _leader_on_mean(probability: Mapping[Names, float], of_noise: frozenset[str], aliases: tuple[Alias, ...]) -> Names:
+    physics = {k: p for k, p in probability.items() if k != UNKNOWN and not {*k} <= of_noise}
     classes = [_combination_and_alias_swaps(names, aliases) & physics.keys() for names in physics]
     likeliest = max(classes, key=lambda members: sum(physics[names] for names in members), default=set())
     return max(likeliest, key=lambda names: physics[names], default=())
@@ -395,16 +389,10 @@ def _combination_and_alias_swaps(names: Names, aliases: tuple[Alias, ...]) -> se
 
 TO_SEPARATE = "; to tell "
 """Introduces the next readings in the reason of `cannot_tell`."""
-ALL = "them apart"
-"""What they tell if they separate all hypotheses that the reason names."""
-NOTHING_MORE = "nothing more"
-"""The hypothesis of no effect beside those that are certain."""
-
-NOTHING = "nothing missing"
-"""The hypothesis of no effect at all."""
-
-OPEN = 0.05
-"""Least probability of a rival: what has less is no open question."""
+ALL = "them apart"  # what they tell if they separate all hypotheses that the reason names
+NOTHING_MORE = "nothing more"  # the hypothesis of no effect beside those that are certain
+NOTHING = "nothing missing"  # the hypothesis of no effect at all
+OPEN = 0.05  # least probability of a rival: what has less is no open question
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,7 @@ from probewise.systems.forms import WORDS
 Names: TypeAlias = tuple[str, ...]
 """The effects of a combination, by name."""
 
-UNKNOWN: Names = ("unknown",)
-"""The combination of an effect out of vocabulary that is not named."""
+UNKNOWN: Names = ("unknown",)  # the combination of an effect out of vocabulary that is not named
 
 _LEAST_P = 1e-300  # smallest p-value that floating point represents reliably
 

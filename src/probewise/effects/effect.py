@@ -35,14 +35,12 @@ AGAIN = "~again"
 PHASE = Uniform(-2 * np.pi, 2 * np.pi)
 """Prior of a phase, two full turns: every phase has an equivalent far from both ends."""
 
-ROWS_OF_A_SIDE = 5
-"""Least number of rows on which an effect rests, on either side where it is switched."""
+ROWS_OF_A_SIDE = 5  # least number of rows on which an effect rests, on either side where it is switched
 
 LEAST_VISIBLE = 4.0
 """Least size (lambda) of a detectable effect: there the test at level .01 has a power above one half."""
 
-MOST_FREQUENCIES = 1024
-"""Largest number of trial frequencies of a wave."""
+MOST_FREQUENCIES = 1024  # largest number of trial frequencies of a wave
 
 Act: TypeAlias = Callable[[Any, FloatArray, Any], Any]
 """Function of the stage's value, parameters (n_samples, n_params) and the plan or table; returns the value with the
@@ -87,8 +85,7 @@ class Where:
     patterns: tuple[str, ...] = ()
 
 
-EVERYWHERE = Where()
-"""On all scans and patterns, counting from 0."""
+EVERYWHERE = Where()  # on all scans and patterns, counting from 0
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from probewise._arrays import TINY, FloatArray, varies
+from probewise._arrays import ROUNDING, TINY, FloatArray, varies
 from probewise._words import unit_after_number, value_with_sd
 from probewise.effects.effect import (
     Act,
@@ -36,7 +36,8 @@ _TELLING = 15.0  # least ratio of a lattice's step to the rounding of the printe
 _FINE = 1e-2  # of the range
 _FINEST = 1e-5  # of the range: the least step of a lattice that is looked for
 _ON_A_LINE = 5  # least distinct values of a column that is the readings in another unit
-_DIGITS = 1e-6  # of a step: below this a difference is rounding
+_DIGITS = 1e-6  # of a step, a range or a noise sd: below this a difference is rounding
+_N_SHARES = 12
 
 
 def _on_noise(
@@ -44,10 +45,7 @@ def _on_noise(
     from_prior: bool = True,
     **more: Any,
 ) -> Effect:  # fmt: skip
-    """Return an effect with nodes of its prior: midpoints of `n_nodes` equal shares along each parameter.
-
-    Unless `from_prior`, the nodes under which evidence is computed are from elsewhere.
-    """
+    """Return an effect with nodes of its prior: midpoints of `n_nodes` equal shares along each parameter."""
     axes = [(np.arange(n) + 0.5) / n for n in n_nodes]
     u = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, len(axes))
     entries = Product(priors_and_units(parameters)[0]).from_unit_cube(u)[:, None, :]
@@ -55,8 +53,7 @@ def _on_noise(
     return kind.bind(of, parameters, act, entries, says, kind=NoiseEffect, nodes_per_parameter=nodes, **more)
 
 
-SD_FACTORS = LogUniform(0.25, 6.0)
-"""Prior of the noise sd since the calibration, in units of the sd then."""
+SD_FACTORS = LogUniform(0.25, 6.0)  # prior of the noise sd since the calibration, in units of the sd then
 
 
 @light_effect(
@@ -163,14 +160,12 @@ def noise_of_runs(runs: tuple[str, ...], n_rows: Any = 1) -> NoiseEffect:
         says,
         amplitudes=(),
         absent=dict.fromkeys(range(len(runs)), 1.0),
-        nodes_about=partial(_most_probable_run_values, len(runs)),
+        nodes_about=partial(_likeliest_run_values, len(runs)),
         draws_about=lambda nodes, rng: np.asarray(nodes * np.exp(widths * rng.standard_normal(nodes.shape))),
     )
 
 
-def _most_probable_run_values(
-    n_runs: int, residuals: FloatArray, rows: FittedReadings
-) -> tuple[FloatArray, FloatArray]:
+def _likeliest_run_values(n_runs: int, residuals: FloatArray, rows: FittedReadings) -> tuple[FloatArray, FloatArray]:
     """Return the runs' most probable values, (n_nodes, n_runs), and log Laplace weights, (n_nodes,).
 
     There is one node for each of five assumed sds, between runs, of the values' logs; none for a single run.
@@ -207,20 +202,18 @@ def _most_probable_log_sd_ratios(counts: FloatArray, squares: FloatArray, spread
         along, turned = 2 * share / curvature, slope / curvature
         step = turned - along * float(np.sum(2 * share * turned)) / (-float(2 * share.sum()) + float(2 * share @ along))
         logs = logs + np.clip(step, -1.0, 1.0)
-        if np.abs(step).max() < 1e-9:
+        if np.abs(step).max() < ROUNDING:
             break
     return np.asarray(logs)
 
 
-FAR = 4.0
-"""Noise sds from its prediction beyond which a reading may be lost rather than noisy."""
+FAR = 4.0  # noise sds from its prediction beyond which a reading may be lost rather than noisy
 
 LARGEST_SIZE = 40.0
 """Largest sd of outlying readings, in noise sds; readings too far out for it are lost ones (`diagnosis.outlying`)."""
 
 
-MOST_OUTLYING = 0.2
-"""Largest share of outlying or of lost readings."""
+MOST_OUTLYING = 0.2  # largest share of outlying or of lost readings
 
 
 _SHARES = LogUniform(2e-3, MOST_OUTLYING)
@@ -292,13 +285,13 @@ def _commonest_far_value(
     """
     far = rows.readings[np.abs(residuals) > FAR]
     # Floats differ in their last digits, so the value is one of the readings, not their mean.
-    n_alike = (np.abs(far[:, None] - far) <= 1e-6 * rows.sd).sum(axis=0)
-    at_end = (np.abs(far[:, None] - np.array(ends)) <= 1e-6 * rows.sd).any(axis=1)
+    n_alike = (np.abs(far[:, None] - far) <= _DIGITS * rows.sd).sum(axis=0)
+    at_end = (np.abs(far[:, None] - np.array(ends)) <= _DIGITS * rows.sd).any(axis=1)
     if not (at_end | (n_alike > 1)).any():
         return np.zeros((0, 2)), np.zeros(0)
     value = far[int(np.argmax(n_alike + 0.5 * at_end))]
-    shares = _SHARES.from_unit((np.arange(12) + 0.5) / 12)
-    return np.stack([shares, np.full(12, value)], axis=1), np.full(12, -np.log(12))
+    shares = _SHARES.from_unit((np.arange(_N_SHARES) + 0.5) / _N_SHARES)
+    return np.stack([shares, np.full(_N_SHARES, value)], axis=1), np.full(_N_SHARES, -np.log(_N_SHARES))
 
 
 def _drawn_share_and_value(
@@ -326,8 +319,7 @@ def _rounding_in_words(unit: str, mean: FloatArray, sd: FloatArray) -> str:
     return f"the readings are rounded to steps of {size}, which were not declared"
 
 
-ROUNDING_SEEN_ABOVE = 0.3
-"""Smallest step, in noise sds, that counts: a finer lattice is only the printing of digits."""
+ROUNDING_SEEN_ABOVE = 0.3  # smallest step, in noise sds, that counts: a finer lattice is only the printing of digits
 
 
 @light_effect("quantisation", Stage.NOISE, "rounded readings", ("lattice",))
@@ -355,7 +347,7 @@ def lattice_step(readings: FloatArray) -> float:
     values = np.unique(readings[np.isfinite(readings)])
     if len(values) < 3:
         return 0.0
-    least = 1e-6 * float(values[-1] - values[0])
+    least = _DIGITS * float(values[-1] - values[0])
     exact = _greatest_common_step(values, least)
     return _step_of_rounded_lattice(values, exact or 10 * least) or exact
 
@@ -392,7 +384,7 @@ def sd_of_estimated_lattice_step(readings: FloatArray, step: float) -> float:
     """
     values = np.unique(readings[np.isfinite(readings)])
     first = max(math.floor(-math.log10(step)), 0)  # the digits are no coarser than the step, which may be tiny
-    fits = (np.allclose(values, np.round(values, n), rtol=0, atol=1e-6 * 10.0**-n) for n in range(first, first + 10))
+    fits = (np.allclose(values, np.round(values, n), rtol=0, atol=_DIGITS * 10.0**-n) for n in range(first, first + 10))
     digit = next((10.0**-n for n, fit in enumerate(fits, first) if fit), 0.0)
     reach = float(np.linalg.norm(values - values.mean())) / step
     return max(sd_of_rounding(digit) / reach, _DIGITS * step)
@@ -421,10 +413,7 @@ def _step_of_rounded_lattice(values: FloatArray, rounding: float) -> float:
 
 
 def _greatest_common_step(values: FloatArray, tolerance: float) -> float:
-    """Find the greatest step of which all gaps of sorted values are multiples; 0 if at most ten times the tolerance.
-
-    Euclid's algorithm on their differences; a remainder below the tolerance counts as rounding.
-    """
+    """Find the greatest step of which all gaps of sorted values are multiples; 0 if at most ten times the tolerance."""
     step = 0.0
     for gap in np.diff(values):
         larger, smaller = max(step, float(gap)), min(step, float(gap))

@@ -134,10 +134,7 @@ def distinct_scan_lines(plan: Plan) -> tuple[ScanLine, ...]:
 
 
 def _principal_angle_rad(places_mm: FloatArray) -> float:
-    """Return the angle to X of the principal axis of places, (n_places, 2), above -89.5 and up to 90.5 degrees.
-
-    So places that scatter about a line along Y have an angle of about 90 degrees, and never one of -90.
-    """
+    """Return the angle to X of the principal axis of places, (n_places, 2), above -89.5 and up to 90.5 degrees."""
     x_mm, y_mm = (axis - axis.mean() for axis in (places_mm - places_mm[0]).T)  # exactly 0 for an axis that rests
     angle = 0.5 * float(np.arctan2(2 * x_mm @ y_mm, x_mm @ x_mm - y_mm @ y_mm))
     return angle + np.pi if angle < _LEAST_ANGLE_RAD else angle
@@ -330,9 +327,7 @@ def _with_changed_regions(view: SceneView, plan: Plan, changed: Callable[[Region
 
 
 @edge_distance.register
-def _distance_to_unchanged_edge(
-    region: RegionWithGradient | RegionWithPatch, x_mm: FloatArray, y_mm: FloatArray
-) -> FloatArray:
+def _distance_to_edge(region: RegionWithGradient | RegionWithPatch, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
     """Return the distance of points from the nearest edge of the region, which the effect leaves in place, mm."""
     return edge_distance(region.region, x_mm, y_mm)
 

@@ -70,8 +70,7 @@ def is_far_from_zero(values: FloatArray, length: float) -> bool:
     return float(np.nanmin(np.abs(values))) > _FAR * length > 0.0
 
 
-ZERO = Origin()
-"""Time 0 and the place (0, 0)."""
+ZERO = Origin()  # time 0 and the place (0, 0)
 
 
 @dataclass(frozen=True, eq=False)

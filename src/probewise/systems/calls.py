@@ -141,7 +141,7 @@ class Caller:
         allowed = "finite readings: look for empty cells, divisions by 0 and priors that are too wide"
         require(sound.any(), "simulate", found, allowed)
         at, again = int(np.argmax(sound)), Caller(self.simulate, self.broadcasts, self.by_row)
-        same = nearly_equal(again(*_values_of_sample(samples, columns, at), strict=True), readings[[at]])
+        same = nearly_equal(again(*_of_sample(samples, columns, at), strict=True), readings[[at]])
         no_state = "no random numbers (declare the noise instead), no state kept between calls"
         found = "different when it is called again with the same parameters"
         require(same, "simulate", found, f"the same readings each time: {no_state}")
@@ -154,12 +154,12 @@ class Caller:
         """
         n_samples = number_of_samples(parameters, columns)
         n_points = max(np.shape(v)[-1] for v in columns.values())
-        each = (_values_of_sample(parameters, columns, k) for k in range(n_samples))
+        each = (_of_sample(parameters, columns, k) for k in range(n_samples))
         with np.errstate(all="ignore"):
             if self.broadcasts and self._takes_changed_columns_together(parameters, columns):
-                return self._call_together(parameters, columns, (n_samples, n_points), strict=strict)
+                return self._call_all(parameters, columns, (n_samples, n_points), strict=strict)
             if self.broadcasts:
-                return np.concatenate([self._call_together(*own, (1, n_points), strict=strict) for own in each])
+                return np.concatenate([self._call_all(*own, (1, n_points), strict=strict) for own in each])
             out, first_error = np.full((n_samples, n_points), np.nan), None
             by_row = self.by_row if n_points == 1 else ()  # arrays even if there is only one row in the table
             samples = [
@@ -185,9 +185,7 @@ class Caller:
                 raise first_error
         return out
 
-    def _call_together(
-        self, parameters: Values, columns: Columns, shape: tuple[int, int], *, strict: bool
-    ) -> FloatArray:
+    def _call_all(self, parameters: Values, columns: Columns, shape: tuple[int, int], *, strict: bool) -> FloatArray:
         """Call a broadcasting `simulate` once; if it raises, halve the samples until failing ones are alone: NaN."""
         n_samples, n_points = shape
         self._count_call()
@@ -202,7 +200,7 @@ class Caller:
             parts = []
             for low, high in ((0, n_samples // 2), (n_samples // 2, n_samples)):
                 p, u = (take_samples(values, slice(low, high)) for values in (parameters, columns))
-                parts.append(self._call_together(p, u, (high - low, n_points), strict=False))
+                parts.append(self._call_all(p, u, (high - low, n_points), strict=False))
             return np.concatenate(parts)
         return _readings_broadcast_to_shape(readings, shape)
 
@@ -221,7 +219,7 @@ class Caller:
                 given[name] = np.stack([columns[name][0], 1.01 * columns[name][0] + 0.01 * size])
             trial = Caller(self.simulate, broadcasts=True, _taken_together={changed: True})
             try:
-                apart = [trial(*_values_of_sample(own, given, k), strict=True) for k in range(2)]
+                apart = [trial(*_of_sample(own, given, k), strict=True) for k in range(2)]
                 self._taken_together[changed] = trial._returns(np.concatenate(apart), own, given)
             except Exception:
                 self._taken_together[changed] = False
@@ -345,9 +343,7 @@ def take_samples(values: Values, samples: slice | IntArray) -> dict[str, Any]:
     return {name: v[samples] if np.ndim(v) == 2 and len(v) > 1 else v for name, v in values.items()}
 
 
-def _values_of_sample(
-    parameters: Values, columns: Columns, k: int
-) -> tuple[dict[str, FloatArray], dict[str, NDArray[Any]]]:
+def _of_sample(parameters: Values, columns: Columns, k: int) -> tuple[dict[str, FloatArray], dict[str, NDArray[Any]]]:
     """Return the parameters of sample k, (1, 1 or n_points) each, and its columns, (n_points,) each."""
     own, table = (take_samples(each, slice(k, k + 1)) for each in (parameters, columns))
     return own, {name: v[0] if np.ndim(v) == 2 else v for name, v in table.items()}

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg.lapack import dtbtrs
 
-from probewise._arrays import TINY, FloatArray, IntArray
+from probewise._arrays import LAST_DIGITS, TINY, FloatArray, IntArray
 from probewise.systems.calls import number_of_samples
 from probewise.systems.law import LawWithEffects, Method, StepInputs, Steps, of_columns, rosenbrock_step, values_at_rows
 from probewise.systems.simulator import Columns, Law, Values
@@ -26,7 +26,6 @@ _NEWTONS = 8  # iterations with a sample's own Jacobian
 _HOPELESS = 4  # of these, after which a sample that still changes by a tenth is left to be stepped
 _SLOW = 0.1  # change of a chord iteration, in that of the one before, from which a sample needs its own Jacobian
 _CONVERGED = 1e-8  # largest change of a state by an iteration, in that state's largest value
-_SETTLED = 1e-12  # and by the next
 _NUDGE = 1e-7  # of each state's largest value, for the Jacobian
 _FAR = 1e-3  # change from a known trajectory, in a state's largest value, from which another one is remembered
 _MOST_NEW = 8  # trajectories remembered of one batch
@@ -118,9 +117,8 @@ class Stepper:
             moving = way * at[state]
             if not at_rest.any():
                 return moving
-            return np.where(
-                at_rest, motion.friction_of[state] - np.abs(motion.rates(at, between(share))[state]), moving
-            )
+            pull = np.abs(motion.rates(at, between(share))[state])
+            return np.where(at_rest, motion.friction_of[state] - pull, moving)
 
         last = margin_to_transition(after, begin + length)
         ends = last < 0
@@ -265,7 +263,7 @@ def _solve_all_steps(
     """Solve for the states at the end of every step, each sample from the `nearest`, (n_samples,), of those known.
 
     With the solution come up to eight converged samples that are far from the trajectories they began from, each with
-    its last Jacobian, as of `jacobian_bands_and_residuals`, where one was computed.
+    its last Jacobian, as of `bands_and_residuals`, where one was computed.
     """
     guess = np.stack([each.states for each in known], axis=1)[:, nearest]
     search = _NewtonState(law_and_inputs, steps, guess.copy())
@@ -279,7 +277,7 @@ def _solve_all_steps(
             own = nearest[samples] == number
             if not known[number].bands:
                 at = known[number].states[:, None]
-                known[number].bands.extend(search.jacobian_bands_and_residuals(samples[own][:1], at)[0])
+                known[number].bands.extend(search.bands_and_residuals(samples[own][:1], at)[0])
             correction[:, own] = _solved_corrections(known[number].bands[0], missed[:, own], shared=True)
         search.apply_correction(samples, correction)
         far = ~(search.change < _FAR)
@@ -296,7 +294,7 @@ def _solve_all_steps(
         samples = np.flatnonzero(search.active)
         if not samples.size:
             break
-        bands, missed = search.jacobian_bands_and_residuals(samples, search.states[:, samples])
+        bands, missed = search.bands_and_residuals(samples, search.states[:, samples])
         correction = _solved_corrections(np.concatenate(bands), missed, shared=False)
         last |= dict(zip(samples.tolist(), bands, strict=True))
         search.apply_correction(samples, correction)
@@ -306,10 +304,7 @@ def _solve_all_steps(
 
 @dataclass(eq=False)
 class _NewtonState:
-    """State of the Newton iteration: all samples' states at every step, and the convergence of each sample.
-
-    A sample is `done` when it has converged, and `active` while it may yet.
-    """
+    """State of the Newton iteration: all samples' states at every step, and the convergence of each sample."""
 
     law_and_inputs: LawAndInputs
     steps: Steps
@@ -340,9 +335,7 @@ class _NewtonState:
         states = self.states[:, samples]
         return self.states_at_step_ends(samples, states) - states[:, :, 1:]
 
-    def jacobian_bands_and_residuals(
-        self, samples: IntArray, states: FloatArray
-    ) -> tuple[list[FloatArray], FloatArray]:
+    def bands_and_residuals(self, samples: IntArray, states: FloatArray) -> tuple[list[FloatArray], FloatArray]:
         """Return samples' Jacobians of the equations of all steps, and the residuals as of `step_residuals`.
 
         They are those at states (n_states, n, n_steps + 1, n_runs). A Jacobian is its bands, (n_unknowns, 2 n_states):
@@ -371,7 +364,7 @@ class _NewtonState:
         with np.errstate(all="ignore"):
             rate = np.where(np.isfinite(self.change[samples]), change / self.change[samples], 0.0)
         first = ~np.isfinite(self.change[samples])
-        self.done[samples] = (change < _CONVERGED) & (np.where(first, 1.0, rate) * change < _SETTLED)
+        self.done[samples] = (change < _CONVERGED) & (np.where(first, 1.0, rate) * change < LAST_DIGITS)
         self.active[samples] = np.isfinite(change) & ~self.done[samples]
         self.change[samples], self.rate[samples] = change, rate
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from probewise._arrays import FloatArray, IntArray, floats
+from probewise._arrays import ROUNDING, FloatArray, IntArray, floats
 from probewise.errors import ShapeError
 from probewise.systems.calls import call_on_read_only, call_on_views
 from probewise.systems.simulator import Columns, Law, Values
@@ -156,7 +156,7 @@ def steps_for_table(table: RunTable, max_step: float, *, stiff: bool = False) ->
     for own in by_run:
         place[own] = np.arange(len(own))
     gaps = np.diff(table.time_s[rows], axis=0)
-    n_steps = np.maximum(np.ceil(gaps.max(axis=1, initial=0.0) / max_step - 1e-9), 1).astype(np.int64)
+    n_steps = np.maximum(np.ceil(gaps.max(axis=1, initial=0.0) / max_step - ROUNDING), 1).astype(np.int64)
     n_before, gap = np.append(0, np.cumsum(n_steps)), np.repeat(np.arange(len(n_steps)), n_steps)
     share = (np.arange(len(gap)) - n_before[gap]) / n_steps[gap]
     of_runs = (np.repeat(each, len(by_run)) for each in (share, 1.0 / n_steps[gap]))

@@ -11,7 +11,7 @@ from typing import Any, cast
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from probewise._arrays import MOST_NUMBERS, BoolArray, FloatArray, IntArray, own_arithmetic
+from probewise._arrays import LAST_DIGITS, MOST_NUMBERS, BoolArray, FloatArray, IntArray, own_arithmetic
 from probewise._display import ShowsItself
 from probewise._kinds import require_rng
 from probewise._words import count_with_noun
@@ -42,7 +42,6 @@ from probewise.systems.table import (
 
 _FEW = 20  # samples used to find rows that cannot be predicted
 _LEAST_RUNS = 3  # recorded runs whose spread tells what a new one may have
-_EDGE = 1e-12
 _SOME = 200  # samples used to estimate the scatter of predictions in each row
 
 
@@ -157,7 +156,7 @@ def predict_system(
     chain = system.chain(own, _bound_effects(fitted, own))
     theta, is_drawn = _chain_samples_and_whether_drawn(fitted, chain, rng=rng)
     n_samples, per_block = len(theta), max(1, MOST_NUMBERS // max(1, len(whole)))
-    given, lost = _filled_table_and_unpredictable_mask(chain, theta, whole)
+    given, lost = _filled_table_and_mask(chain, theta, whole)
     known, earlier = _recorded_before(fitted, own, recorded, ~lost[:before])
     ignored, lost = np.append(~known.usable, lost[before:]), lost[before:]
     chain = _chain_with_converged_step(chain, theta, given, float(np.median(fitted.noise_sd)))
@@ -199,10 +198,7 @@ def predict_system(
 
 
 def _with_recorded_rows_before(fitted: FittedSystem, table: RunTable) -> tuple[RunTable, IntArray]:
-    """Put the recorded rows of a table's runs before their first rows in it first; also return their numbers, by time.
-
-    A column that the recording lacks is missing in these rows.
-    """
+    """Put first the recorded rows of a table's runs before their first rows in it; also return their numbers."""
     if fitted.known is None or not (table.has_varying_time and fitted.known.table.has_varying_time):
         return table, np.zeros(0, dtype=np.int64)
     recorded, first, columns = fitted.known.table, _first_times(table), {}
@@ -301,9 +297,7 @@ def _number_of_first_row(fitted: FittedSystem, recording: RunRecording) -> int:
     return int(starts[0])
 
 
-def _filled_table_and_unpredictable_mask(
-    chain: SystemChain, theta: FloatArray, table: RunTable
-) -> tuple[RunTable, BoolArray]:
+def _filled_table_and_mask(chain: SystemChain, theta: FloatArray, table: RunTable) -> tuple[RunTable, BoolArray]:
     """Interpolate the missing cells that predictions need, and find the rows that cannot be predicted without them.
 
     Returns the table with these cells interpolated within runs, and the mask of the rows without a prediction,
@@ -379,10 +373,7 @@ def _smoothing_width_by_row(chain: SystemChain, theta: FloatArray, table: RunTab
 def _chain_samples_and_whether_drawn(
     fitted: FittedSystem, chain: SystemChain, *, rng: np.random.Generator
 ) -> tuple[FloatArray, bool]:
-    """Arrange the samples by the columns of a chain, (n_samples, n_params); also return whether any were drawn.
-
-    Drawn are the parameters of runs outside the recording.
-    """
+    """Arrange the samples by the columns of a chain, (n_samples, n_params); also return whether any were drawn."""
     at = {name: k for k, name in enumerate(fitted.names)}
     n, system, is_drawn = len(fitted.samples), chain.system, False
     fixed = {f"{form.name}.{name}" for form in chain.effects for name in getattr(form, "fixed", ())}
@@ -413,8 +404,8 @@ def _chain_samples_and_whether_drawn(
         elif known.shape[1] < _LEAST_RUNS:  # one stratified draw from the prior for each sample
             out[:, k] = prior.from_unit((rng.permutation(n) + rng.random(n)) / n)
         else:
-            drawn = draw_value_for_new_run(ndtri(np.clip(prior.to_unit(known), _EDGE, 1 - _EDGE)), rng=rng)
-            out[:, k] = prior.from_unit(np.clip(ndtr(drawn), _EDGE, 1 - _EDGE))
+            drawn = draw_value_for_new_run(ndtri(np.clip(prior.to_unit(known), LAST_DIGITS, 1 - LAST_DIGITS)), rng=rng)
+            out[:, k] = prior.from_unit(np.clip(ndtr(drawn), LAST_DIGITS, 1 - LAST_DIGITS))
     return out, is_drawn
 
 

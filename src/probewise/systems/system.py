@@ -386,8 +386,7 @@ class SystemChain:
         return effects_with_columns(self.effects, self.system.n_params)
 
 
-STANDS_STILL = 0.02
-"""Noise sds, rms, that predictions may move by when the step of the integration is halved."""
+STANDS_STILL = 0.02  # noise sds, rms, that predictions may move by when the step of the integration is halved
 
 
 def with_converged_step(

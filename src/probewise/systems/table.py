@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probewise._arrays import (
+    LAST_DIGITS,
     BoolArray,
     FloatArray,
     IntArray,
@@ -236,7 +237,7 @@ class RunRecording(Recording):
     sd_column: str = ""
     """Column with the sd of each reading; "": all have the same sd."""
 
-    least_share_of_span: ClassVar[float] = 1e-12
+    least_share_of_span: ClassVar[float] = LAST_DIGITS
     """Least noise as a share of the span of the readings: set by arithmetic, since real noise may be a millionth."""
 
     def _require_plan(self) -> None:

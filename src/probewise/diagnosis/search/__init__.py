@@ -50,23 +50,10 @@ from probewise.diagnosis.sensors import (
     starts_with_more_gaussians,
     with_free_form,
 )
-from probewise.diagnosis.templates import (
-    TemplateBank,
-    TemplateCache,
-    log_bayes_factors_of_pairs,
-    log_mean_exp,
-)
+from probewise.diagnosis.templates import TemplateBank, TemplateCache, log_bayes_factors_of_pairs, log_mean_exp
 from probewise.diagnosis.unknown_bases import bank_of_unknown_effects, bases_unlike_named, without_products_like
 from probewise.diagnosis.words import UNKNOWN, Names
-from probewise.effects import (
-    AGAIN,
-    PROPOSAL,
-    Effect,
-    Extent,
-    NoiseEffect,
-    is_out_of_vocabulary,
-    name_of_first_copy,
-)
+from probewise.effects import AGAIN, PROPOSAL, Effect, Extent, NoiseEffect, is_out_of_vocabulary, name_of_first_copy
 from probewise.effects.noise import lattice_step, noise_sd, sd_of_rounding
 from probewise.errors import NotConvergedError
 from probewise.progress import Progress, silent
@@ -77,9 +64,9 @@ _REFITTED_WITHIN = 6.0
 # Share of the largest gain that an effect must promise to be refitted where it is 40 nats behind: refits of a pendulum
 # gain up to 1.6 times what screening sees, and what was left out is screened again beside the leader.
 _OUTDONE = 0.5
-_SINGLES = 6  # effects that are refitted alone; a bound on cost
+_FEW = 6  # hypotheses that are refitted at once: effects alone, at other SSF orders, or late; a bound on cost
 _HIDDEN = 3  # effects that noise with memory may hide, refitted beside these; a bound on cost
-_BEAM = 8  # combinations that are refitted at each size above one
+_BEAM = 8  # combinations that are refitted at each size above one, and formulas
 # Shares of a limited budget of refits that single effects, and then pairs, may use up: without a part kept for them,
 # pairs would never be refitted.
 _SHARES = (0.6, 0.9)
@@ -102,7 +89,6 @@ _ABSORBED = 0.01  # of a trace; of what a null takes up all but so little no ref
 # beside another that it makes superfluous, and the right pair may be built from the part that looked worse.
 _ELIMINATED = 3
 _SWAPPED = 2  # combinations that lead beside what is left, with what was left out or another
-_MOST_AT_OTHER_ORDERS = 6  # leading combinations that are refitted at other SSF orders
 _REFITTED_AT_OTHER_ORDERS = 1e-4  # probability of such a combination, among those with a formula
 
 
@@ -170,13 +156,11 @@ class SearchState:
         parts = ([e for e in lacking if is_out_of_vocabulary(e.name) == rare] for rare in (False, True))
         return [self.refits.templates.coarse_bank(about.found, effects) for effects in parts if effects]
 
-    def log_bayes_factors_by_effect(
-        self, parent: WeighedFit, law: NoiseLaw, about: WeighedFit
-    ) -> dict[str, FloatArray]:
+    def log_bayes_factors_by_effect(self, of: WeighedFit, law: NoiseLaw, about: WeighedFit) -> dict[str, FloatArray]:
         """Return, by effect, the log Bayes factors of its templates about a candidate or its null, (n_templates,)."""
         out: dict[str, FloatArray] = {}
         for bank in self.template_banks(about):
-            out |= bank.log_bayes_factors_by_label(parent.found, law)
+            out |= bank.log_bayes_factors_by_label(of.found, law)
         return out
 
     def complexity_penalty(self, degrees_of_freedom: int, each: float | None = None) -> float:
@@ -297,7 +281,7 @@ class SearchState:
         return max(screened, default=-np.inf)
 
 
-def competing_candidates(names: Names, among: Iterable[WeighedFit]) -> list[WeighedFit]:
+def competitors(names: Names, among: Iterable[WeighedFit]) -> list[WeighedFit]:
     """List the candidates that compete with a combination: those in the vocabulary, or all if it is out of it."""
     return [c for c in among if effects_out_of_vocabulary(names) or not effects_out_of_vocabulary(c.names)]
 
@@ -388,7 +372,7 @@ def select_forward(state: SearchState, *, depth: int) -> None:
     within = {c: _ORDERS_WITHIN if c.ssf_degrees_of_freedom <= freedom else ENOUGH_NATS for c in state.nulls}
     parents = [c for c in state.nulls if c.log_z > null.log_z - within[c]]
     for size in range(1, min(depth, len(state.effects)) + 1):
-        asked = _proposals_to_refit(state, null, parents, size)
+        asked = _proposals_to_try(state, null, parents, size)
         state.share = _SHARES[size - 1] if size <= len(_SHARES) else 1.0
         refitted = []
         for k, proposal in enumerate(asked):
@@ -402,20 +386,16 @@ def select_forward(state: SearchState, *, depth: int) -> None:
         kept = list({c.names: c for c in refitted if c is not None}.values())
         if not kept:
             break
-        parents = [
-            c for c in kept if c.log_z > max(r.log_z for r in competing_candidates(c.names, kept)) - EXTENDED_WITHIN
-        ]
+        parents = [c for c in kept if c.log_z > max(r.log_z for r in competitors(c.names, kept)) - EXTENDED_WITHIN]
 
 
-def _proposals_to_refit(
-    state: SearchState, null: WeighedFit, parents: Sequence[WeighedFit], size: int
-) -> list[Proposal]:
+def _proposals_to_try(state: SearchState, null: WeighedFit, parents: Sequence[WeighedFit], size: int) -> list[Proposal]:
     """Choose the combinations of `size` effects to refit, each as a candidate (parent) with one more effect."""
     proposals: dict[Names, Proposal] = {}
     for parent in parents:
         proposals = proposals_for(state, parent, proposals)
     if size == 1:
-        alone = _single_effects_to_refit(state, null, proposals)
+        alone = _singles_to_refit(state, null, proposals)
         return [*alone, *_proposals_under_simplest_noise(state, null)]
     best = _largest_scores_about_null(state) if size == 2 else {}
     scores = {names: max(own.score, best.get(names, own.score)) for names, own in proposals.items()}
@@ -479,8 +459,7 @@ def promising_combinations(
     return [
         names
         for names in [*named[:width], *rest[:_MOST_OUT_OF_VOCABULARY]]
-        if odds[names]
-        >= max(state.log_posterior(c) for c in competing_candidates(names, state.candidates.values())) - behind
+        if odds[names] >= max(state.log_posterior(c) for c in competitors(names, state.candidates.values())) - behind
     ]
 
 
@@ -492,9 +471,7 @@ def _is_outdone(state: SearchState, null: WeighedFit, proposal: Proposal) -> boo
     return gain < min(_OUTDONE * best, best - FAR_BEHIND)
 
 
-def _single_effects_to_refit(
-    state: SearchState, null: WeighedFit, proposals: Mapping[Names, Proposal]
-) -> list[Proposal]:
+def _singles_to_refit(state: SearchState, null: WeighedFit, proposals: Mapping[Names, Proposal]) -> list[Proposal]:
     """Choose the effects to refit alone: the leader, those not far behind, and those that screening cannot judge.
 
     Screening is linear: it cannot judge a user's own effect with a large, nonlinear change, nor an effect that the
@@ -509,7 +486,7 @@ def _single_effects_to_refit(
     # One of two waves alone explains little: the other is noise to it.
     twice = {name for name in state.effects if name + AGAIN in state.effects}
     always = state.tried_always | faint | twice
-    chosen = promising_combinations(state, scores, width=_SINGLES, behind=_REFITTED_WITHIN)
+    chosen = promising_combinations(state, scores, width=_FEW, behind=_REFITTED_WITHIN)
     wanted = dict.fromkeys([*ranked[:1], *chosen, *(names for names in ranked if names[0] in always)])
     return [proposals[n]._replace(score=math.inf) if n[0] in always else proposals[n] for n in wanted]
 
@@ -600,8 +577,8 @@ def refit_at_other_orders(state: SearchState, by_mean: Mapping[Names, float]) ->
     """
     known = sum(p for names, p in by_mean.items() if names != UNKNOWN)
     leaders = sorted((names for names in by_mean if names not in ((), UNKNOWN)), key=lambda n: -by_mean[n])
-    for k, names in enumerate(leaders[:_MOST_AT_OTHER_ORDERS]):
-        state.progress("refitting at other numbers of Gaussians", k, min(len(leaders), _MOST_AT_OTHER_ORDERS))
+    for k, names in enumerate(leaders[:_FEW]):
+        state.progress("refitting at other numbers of Gaussians", k, min(len(leaders), _FEW))
         source = state.best_candidate(names)
         if source is None or by_mean[names] < _REFITTED_AT_OTHER_ORDERS * known:
             continue
@@ -628,13 +605,10 @@ def _refit_with_form_of(state: SearchState, source: WeighedFit, null: WeighedFit
         state.store_candidate(candidate)
 
 
-MAX_ORDER = 3
-"""Gaussians of the SSF that are tried; one more where that is not far behind."""
-
+MAX_ORDER = 3  # Gaussians of the SSF that are tried; one more where that is not far behind
 _FEW_READINGS = 40  # usable readings below which one Gaussian is tried, and no free form
 _NULL_TRIED_AGAIN = 2  # fits of one effect from which a given null is fitted once more
 _REFITTED_LATE = 0.02  # probability by screening alone, from which on a combination is refitted
-_MOST_REFITTED_LATE = 6  # such combinations
 _WITH_UNKNOWN = 4  # refitted combinations that something unknown is weighed beside
 
 
@@ -829,8 +803,8 @@ def _refit_favoured_by_screening(state: SearchState, posterior: Callable[[], Hyp
     """
     shortfalls: list[float] = []
     screened = set[WeighedFit]()
-    while len(shortfalls) < _MOST_REFITTED_LATE:
-        state.progress("refitting combinations favoured by screening", len(shortfalls), _MOST_REFITTED_LATE)
+    while len(shortfalls) < _FEW:
+        state.progress("refitting combinations favoured by screening", len(shortfalls), _FEW)
         by_mean = posterior().marginal_over_noise
         settled = {(), UNKNOWN} | state.undetected | state.refitted_combinations
         names = max((key for key in by_mean if key not in settled), key=lambda key: by_mean[key], default=())
@@ -848,10 +822,7 @@ def _refit_favoured_by_screening(state: SearchState, posterior: Callable[[], Hyp
 
 
 def _refit_null_from_effects(state: SearchState) -> None:
-    """Refit the null from the best fits with one effect, whose gain may be due to a better mode of the null.
-
-    A better fit replaces the null in the state.
-    """
+    """Refit the null from the best fits with one effect, whose gain may be due to a better mode of the null."""
     null = state.null
     single = [c for c in state.candidates.values() if len(c.names) == 1 and c.log_z > null.log_z]
     for candidate in sorted(single, key=lambda c: -c.log_z)[:_NULL_TRIED_AGAIN]:
@@ -890,7 +861,6 @@ def _build_misfit_templates(state: SearchState, prepared: Prepared) -> MisfitTem
 
 
 _LEFT_FROM = 0.1  # probability that more is left than noise without a memory, from which formulas are proposed
-_MOST = 8  # formulas that are refitted
 # Nats behind the best of what was refitted, within which screening must see a formula: alone, where an effect of
 # hundreds of nats is seen wrongly by a dozen, and beside the best single effect or the leader, whose fits are near.
 _WITHIN_ALONE = 12.0
@@ -919,7 +889,7 @@ def search_with_formulas(searched: Searched, *, progress: Progress = silent) -> 
         for name, value in _promise_by_formula(searched, proposals).items()
     }
     best = max(map(searched.log_posterior, searched.evidences.fits.values()))
-    ranked = sorted(odds, key=lambda name: -odds[name])[:_MOST]
+    ranked = sorted(odds, key=lambda name: -odds[name])[:_BEAM]
     kept = {name: proposals[name] for name in ranked if odds[name] > best}
     if not kept:
         return searched

@@ -30,12 +30,7 @@ from probewise.diagnosis.locate import Covariate
 from probewise.diagnosis.noise import HIDDEN, NoiseLaw, NoiseModel, SdPrior, rough_sd, rounding_that_hides_noise
 from probewise.diagnosis.outlying import outlier_probabilities
 from probewise.diagnosis.prepared import Prepared
-from probewise.diagnosis.templates import (
-    EffectTemplates,
-    TemplateBank,
-    TemplateCache,
-    log_mean_exp,
-)
+from probewise.diagnosis.templates import EffectTemplates, TemplateBank, TemplateCache, log_mean_exp
 from probewise.diagnosis.words import UNKNOWN, Names
 from probewise.effects import NUISANCES, PROPOSAL, Effect, NoiseEffect, is_out_of_vocabulary, name_of_first_copy
 from probewise.effects.effect import ROWS_OF_A_SIDE
@@ -144,9 +139,8 @@ class WeighedFit:
 
     def at_likelier_sd(self, noise: Names) -> NoiseEvidence:
         """Return the evidence under a noise model, with the calibration's noise sd or another, the larger one."""
-        return max(
-            (self.evidence[own] for own in (noise, _changed(noise)) if own in self.evidence), key=lambda e: e.log_z
-        )
+        own = [self.evidence[names] for names in (noise, _changed(noise)) if names in self.evidence]
+        return max(own, key=lambda e: e.log_z)
 
     def split_by_sd(self, changed: NoiseEffect) -> WeighedFit:
         """Return a copy with two noise models for each: with the noise sd of the calibration, and with another."""
@@ -376,13 +370,7 @@ class Refits:
         return self.noises.likeliest_law(candidate.evidence)
 
     def fit_and_weigh(
-        self,
-        model: Model,
-        starts: FloatArray,
-        law: NoiseLaw,
-        max_steps: int = 30,
-        *,
-        beyond: WeighedFit | None = None,
+        self, model: Model, starts: FloatArray, law: NoiseLaw, max_steps: int = 30, *, beyond: WeighedFit | None = None
     ) -> WeighedFit:
         """Fit a model from the best of `starts`, (n_starts, n_params), and compute its evidence under all noise models.
 

@@ -77,7 +77,6 @@ def sentence_with_agreement(reason: str, weighings: Sequence[Weighing]) -> str:
 
 
 N_LIVE = 100
-
 _LEAST, _MOST = 2, 3  # hypotheses to recompute, apart from the null
 _LEAST_PROBABILITY = 0.01
 _MOST_RUNS = 4  # runs from priors near the posterior
@@ -134,10 +133,7 @@ def weigh_thoroughly(
 
 
 def _leading_hypotheses(searched: Searched) -> list[tuple[WeighedFit, Names]]:
-    """List two or three leading refitted hypotheses on the mean, and the null, each with its most probable noise.
-
-    Each has the number of Gaussians of largest evidence; the null, if it is not among them, that of the first.
-    """
+    """List two or three leading refitted hypotheses on the mean, and the null, each with its most probable noise."""
     merged, noise_of = searched.posterior.marginal_over_noise, dict[Names, Names]()
     for mean, noise in searched.posterior.probabilities:  # the most probable first
         noise_of.setdefault(mean, noise)
@@ -168,9 +164,8 @@ def _weigh_by_nested_sampling(
     weighing = Weighing(effects, candidate.n_gaussians, evidence.log_z, math.nan, math.nan)
     once = HypothesisProblem(candidate.found.model, searched.prepared.recording, evidence, candidate.found.z)
     # Laplace's method integrates over one peak, to be counted `n_peaks` times. The whole prior holds them all.
-    log_factor = (
-        candidate.log_share + candidate.log_detectable - sum(math.log(e.n_peaks) for e in candidate.found.model.effects)
-    )
+    log_factor = candidate.log_share + candidate.log_detectable
+    log_factor -= sum(math.log(e.n_peaks) for e in candidate.found.model.effects)
     n_live = max(n_live, nested.LIVE_PER_PARAM * once.model.n_params)
     run = partial(
         nested.run,

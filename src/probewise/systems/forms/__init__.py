@@ -116,10 +116,7 @@ def jumps_at_row(effect: Any) -> bool:
 
 
 def names_in_definitions(about: ReferenceFit, names: Iterable[str]) -> frozenset[str]:
-    """Return those names of effects and formulas in the rate of a state that is another state by definition.
-
-    A bound is none of them: a position may stop, though its rate is the speed.
-    """
+    """Return those names of effects and formulas in the rate of a state that is another state by definition."""
     out = set()
     for name in names:
         kind, *target = name_without_copy_suffix(name).removeprefix(PROPOSAL).split(":")

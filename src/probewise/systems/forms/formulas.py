@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from probewise._arrays import FloatArray, varies
+from probewise._arrays import ROUNDING, FloatArray, varies
 from probewise._words import value_with_sd
 from probewise.effects.effect import (
     PHASE,
@@ -256,7 +256,8 @@ def _forms_of_terms(
             continue
         centred = shape - shape.mean()
         size = float(np.linalg.norm(centred))
-        if size <= 1e-9 * float(np.linalg.norm(shape)) or any(abs(centred @ other) > _SAME * size for other in known):
+        is_constant = size <= ROUNDING * float(np.linalg.norm(shape))
+        if is_constant or any(abs(centred @ other) > _SAME * size for other in known):
             continue
         known.append(centred / size)
         guess = trial_rate(about, state) / float(np.sqrt(np.mean(shape**2))) if state else None

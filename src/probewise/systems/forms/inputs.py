@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from probewise._arrays import FloatArray, distinct_values, rounding_error
+from probewise._arrays import ROUNDING, FloatArray, distinct_values, rounding_error
 from probewise._words import value_with_sd
 from probewise.effects.effect import (
     PHASE,
@@ -31,19 +31,11 @@ from probewise.systems.forms.modulations import (
     trial_frequencies,
     trial_frequencies_in_time,
 )
-from probewise.systems.forms.readings import delayed_values, values_at_earlier_times, within_runs
-from probewise.systems.forms.reference import (
-    AMPLITUDE,
-    POSITIVE,
-    Form,
-    ReferenceFit,
-    clipping_between,
-    period_with_sd,
-)
+from probewise.systems.forms.readings import delayed_values, earlier_values, within_runs
+from probewise.systems.forms.reference import AMPLITUDE, POSITIVE, Form, ReferenceFit, clipping_between, period_with_sd
 from probewise.systems.law import LawWithEffects, Limit
 from probewise.systems.table import covariate_of_column
 
-_NO_SHARE = 1e-9  # of what a bound stops: none
 _NUDGE = 1e-4  # of a column's spread: the step that tests whether it drives the readings
 _MOST_FREQUENCIES = 600
 _MOST_FREQUENCIES_CALLED = 96  # where each is two calls of a person's function
@@ -153,7 +145,7 @@ def mean_of_delayed_held_column(values: FloatArray, theta: FloatArray, time: Flo
     by, gaps = theta[:, 0], np.diff(time)
     there = gaps > rounding_error(time)
     total = np.concatenate([np.zeros((len(values), 1)), np.cumsum(values[:, :-1] * gaps, axis=1)], axis=1)
-    since = values_at_earlier_times(time, total, by) + values[:, :1] * np.minimum(time - by[:, None] - time[0], 0.0)
+    since = earlier_values(time, total, by) + values[:, :1] * np.minimum(time - by[:, None] - time[0], 0.0)
     out = np.array(np.broadcast_to(values, since.shape))
     out[:, :-1][:, there] = np.diff(since, axis=1)[:, there] / gaps[there]
     return out
@@ -272,12 +264,12 @@ def _limit_form(about: ReferenceFit, state: str) -> Iterator[Form]:
         return value.plus(limits=(ceiling, floor))
 
     def says(mean: FloatArray, sd: FloatArray) -> str:
-        shares = {other: value_with_sd(mean[k], sd[k]) for k, other in enumerate(others, 1) if mean[k] > _NO_SHARE}
+        shares = {other: value_with_sd(mean[k], sd[k]) for k, other in enumerate(others, 1) if mean[k] > ROUNDING}
         taken = (f"; {other} takes up {share} of the rest" for other, share in shares.items())
         return says_where(mean, sd) + "".join(taken)
 
     def variant(taking: str | None) -> Form:
-        shares = {other: Uniform(0.0, 1.0) if other == taking else Fixed(0.0, _NO_SHARE) for other in others}
+        shares = {other: Uniform(0.0, 1.0) if other == taking else Fixed(0.0, ROUNDING) for other in others}
         own: Declared = {"level": (ends.prior, state)} | {f"share[{name}]": (p, "1") for name, p in shares.items()}
         bank = single_column_bank(ends.tried, *(0.5 * (other == taking) for other in others))
         given = (f"limit:{state}", Stage.RATE, own, (f"state:{state}", "level"), act, says, bank)

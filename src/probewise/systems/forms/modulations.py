@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from probewise._arrays import TINY, FloatArray, distinct_values
+from probewise._arrays import ROUNDING, TINY, FloatArray, distinct_values
 from probewise._words import unit_of_name, value_with_sd
 from probewise.effects.effect import (
     MOST_FREQUENCIES,
@@ -146,7 +146,7 @@ def _times_of_readings(about: ReferenceFit) -> tuple[FloatArray, list[Any]]:
 def _frequency_of_median_gap(values: FloatArray, groups: list[Any], rows_each: int) -> float:
     reach = float(np.ptp(values))
     gaps = np.concatenate([np.abs(np.diff(values[rows])) for rows in groups])
-    gaps = gaps[gaps > 1e-9 * max(reach, TINY)]
+    gaps = gaps[gaps > ROUNDING * max(reach, TINY)]
     return 1 / (rows_each * float(np.median(gaps))) if gaps.size else 1.0 / reach
 
 

@@ -9,7 +9,7 @@ from typing import cast
 import numpy as np
 from numpy.polynomial.chebyshev import chebfit, chebval
 
-from probewise._arrays import BoolArray, FloatArray, distinct_values, rounding_error
+from probewise._arrays import ROUNDING, BoolArray, FloatArray, distinct_values, rounding_error
 from probewise._words import value_with_sd
 from probewise.effects.effect import (
     LEAST_VISIBLE,
@@ -34,15 +34,7 @@ from probewise.systems.forms.modulations import (
     sinusoid_modulation,
     time_since_start_of_run,
 )
-from probewise.systems.forms.reference import (
-    AMPLITUDE,
-    N_SIZES,
-    Clipping,
-    Form,
-    ReferenceFit,
-    flag,
-    switch_points,
-)
+from probewise.systems.forms.reference import AMPLITUDE, N_SIZES, Clipping, Form, ReferenceFit, flag, switch_points
 from probewise.systems.table import RunTable, covariate_of_column
 
 _SMOOTH = "smooth"  # name of the parameter that is 0 for the first variant, and 1 for the smooth one
@@ -50,7 +42,7 @@ _ODDS_OF_SMOOTH = 0.05  # prior: the rows of most tables are dense beside what m
 _APART = 1.0  # lambda between the two at some trial size, below which they are the same
 _BEND_DEGREE = 4
 _COEFFICIENTS = "a1", "a2", "a3", "a4", "a5"  # of a curve
-_NONE, _HARDLY = 1e-9, 1e-6  # of a size: none, and more than rounding of none
+_HARDLY = 1e-6  # of a size: more than rounding of none
 
 
 def _cubics(time: FloatArray, values: FloatArray) -> FloatArray:
@@ -146,19 +138,17 @@ def delayed_readings(value: FloatArray, theta: FloatArray, table: RunTable) -> F
     if smooth.size:
         by, own = theta[smooth, 0], value[smooth] if len(value) > 1 else value
         for rows in table.rows_by_scan():
-            out[np.ix_(smooth, rows)] = values_at_earlier_times(table.time_s[rows], own[:, rows], by, smooth=True)
+            out[np.ix_(smooth, rows)] = earlier_values(table.time_s[rows], own[:, rows], by, smooth=True)
     return out
 
 
 @within_runs
 def delayed_values(values: FloatArray, theta: FloatArray, time: FloatArray) -> FloatArray:
     """Return readings or a column, (n_points,) or (n_samples, n_points), delayed within runs by theta[:, 0]."""
-    return values_at_earlier_times(time, values, theta[:, 0])
+    return earlier_values(time, values, theta[:, 0])
 
 
-def values_at_earlier_times(
-    time: FloatArray, values: FloatArray, by: FloatArray, *, smooth: bool = False
-) -> FloatArray:
+def earlier_values(time: FloatArray, values: FloatArray, by: FloatArray, *, smooth: bool = False) -> FloatArray:
     """Interpolate values (1 or n_samples, n), given at times (n,), at times earlier by `by`: (n_samples, n).
 
     Before the first time, the first value holds. Values lie on straight lines, or on a spline if they are `smooth`.
@@ -246,7 +236,7 @@ def _up_to_order(curve: Form, order: int, n_read: int) -> Form:
 
     Otherwise it would be the curve of the order below, or a straight line, which has a name.
     """
-    none = Fixed(-_NONE * curve.entries.max(), _NONE * curve.entries.max())
+    none = Fixed(-ROUNDING * curve.entries.max(), ROUNDING * curve.entries.max())
     highest = cast(HeavyTailedPrior, curve.marginals[_COEFFICIENTS[order - 1]])
     seen = replace(highest, smallest=max(highest.smallest, min(LEAST_VISIBLE / np.sqrt(n_read), 1.0)))
     priors = {**curve.marginals, _COEFFICIENTS[order - 1]: seen, **dict.fromkeys(_COEFFICIENTS[order:], none)}
@@ -254,10 +244,7 @@ def _up_to_order(curve: Form, order: int, n_read: int) -> Form:
 
 
 def _friction_form(about: ReferenceFit, name: str) -> Iterator[Form]:
-    """Yield the friction of a column that moves both ways: a sign or, another variant, a smooth one.
-
-    Rows show a width below the fifth least speed as a sign, one above half of the largest as a bend alone.
-    """
+    """Yield the friction of a column that moves both ways: a sign or, another variant, a smooth one."""
     column, unit = about.table.covariates[name][about.has_reading], about.reading_unit
     points, speeds = switch_points(column), np.sort(np.abs(column[column != 0]))
     if not points.size or not points[0] < 0 < points[-1]:
@@ -266,15 +253,15 @@ def _friction_form(about: ReferenceFit, name: str) -> Iterator[Form]:
 
     @acting
     def act(value: FloatArray, rows: RunTable, a: FloatArray, width: FloatArray) -> FloatArray:
-        return value + a * np.tanh(rows.covariates[name] / np.maximum(width, 0.1 * _NONE * low))
+        return value + a * np.tanh(rows.covariates[name] / np.maximum(width, 0.1 * ROUNDING * low))
 
     def says(mean: FloatArray, sd: FloatArray) -> str:
-        by = f"tanh({name} / width), width {value_with_sd(mean[1], sd[1])}" if mean[1] > _NONE * low else "its sign"
+        by = f"tanh({name} / width), width {value_with_sd(mean[1], sd[1])}" if mean[1] > ROUNDING * low else "its sign"
         size = value_with_sd(mean[0], sd[0], unit)
         return f"{about.system.simulator.reading} has dry friction of {name}: {size} times {by}"
 
-    parameters: Declared = {"a": (AMPLITUDE, unit), "width": (Fixed(0.0, _NONE * low), name)}
-    own = (parameters, (covariate_of_column(name),), act, says, single_column_bank(1.0, 0.5 * _NONE * low))
+    parameters: Declared = {"a": (AMPLITUDE, unit), "width": (Fixed(0.0, ROUNDING * low), name)}
+    own = (parameters, (covariate_of_column(name),), act, says, single_column_bank(1.0, 0.5 * ROUNDING * low))
     for sign in about.form(f"friction:{name}", Stage.OFFSET, *own):
         if low < high:
             widths = single_column_bank(sign.entries[0, 0, 0], np.geomspace(low, high, N_SIZES))

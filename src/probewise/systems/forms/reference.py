@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
-from probewise._arrays import TINY, BoolArray, FloatArray, distinct_values, varies
+from probewise._arrays import ROUNDING, TINY, BoolArray, FloatArray, distinct_values, varies
 from probewise._words import value_with_sd
 from probewise.effects.effect import (
     ROWS_OF_A_SIDE,
@@ -35,7 +35,6 @@ from probewise.systems.simulator import Simulator
 from probewise.systems.system import System, columns_without_reading
 from probewise.systems.table import RunTable
 
-_FLAG_WIDTH = 1e-9  # of its prior
 _BY_CHANCE = 1e-4  # probability below which sorted readings are no chance
 _LOWER_PART = 0.4  # of a range: a ceiling may cut off more of it than a floor
 _LEAST_CUT = 0.003  # of a range, that is cut off at least by what is looked for
@@ -93,8 +92,8 @@ class BlockForm(StepEffect):
 
 def flag(on: bool, odds: float = 1.0) -> tuple[float, Fixed]:
     """Return the value of a parameter that distinguishes two variants of a form, 0 or 1 to 1e-9, and its prior."""
-    value = 1.0 - 0.5 * _FLAG_WIDTH if on else 0.5 * _FLAG_WIDTH
-    return value, Fixed(value - 0.5 * _FLAG_WIDTH, value + 0.5 * _FLAG_WIDTH, odds)
+    value = 1.0 - 0.5 * ROUNDING if on else 0.5 * ROUNDING
+    return value, Fixed(value - 0.5 * ROUNDING, value + 0.5 * ROUNDING, odds)
 
 
 def period_with_sd(frequency: float, sd: float, time_unit: str) -> str:

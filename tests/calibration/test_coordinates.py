@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from probewise.calibration import SSFPrior
-from probewise.calibration.about_peaks import LightContrasts
+from probewise.calibration.peaks import LightContrasts
 from probewise.calibration.quick import WholeFootprintCoordinates
 from probewise.priors import LogUniform, Uniform
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from probewise.calibration import calibrate, default_prior, quick
-from probewise.calibration.about_peaks import LightContrasts, _MixtureAboutPeaks, _StudentTDensity
 from probewise.calibration.paper import ProblemsByOrder, search_prior_of_order
-from probewise.calibration.peaks import climb, starts_of_climbs
+from probewise.calibration.peaks import LightContrasts, _MixtureAboutPeaks, _StudentTDensity, climb, starts_of_climbs
 from probewise.calibration.quick import WholeFootprintCoordinates, _NearPosterior, fit_orders_quickly
 from probewise.nested import Weighted
 from probewise.recordings import paper_plan

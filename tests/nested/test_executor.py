@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
-import itertools
 import multiprocessing
 import sys
-import threading
 from collections.abc import Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -151,20 +149,6 @@ def test_the_check_too_evaluates_its_batches_in_the_executor() -> None:
     result = run(problem, rng=rng(), n_live=50, executor=Within(), n_workers=4)
     assert result.check is not None
     assert set(here) <= {1}  # a single hypothesis is not worth sending
-
-
-def test_parts_of_a_batch_are_evaluated_at_the_same_time() -> None:
-    """The first three parts wait for one another: were they evaluated in turn, none would ever go on."""
-    meeting, calls = threading.Barrier(3, timeout=60), itertools.count()
-
-    def function(theta: np.ndarray) -> np.ndarray:
-        if next(calls) < 3:
-            meeting.wait()
-        return 30 * theta[:, 0]
-
-    problem = problems.Known(problems.box(2, 0, 1), function, 0.0)
-    with ThreadPoolExecutor(3) as pool:
-        assert run(problem, rng=rng(), n_live=30, executor=pool, n_workers=3).complete
 
 
 def test_the_part_that_failed_is_the_one_that_is_told() -> None:

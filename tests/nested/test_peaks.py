@@ -1,4 +1,4 @@
-"""Peaks that a run missed are found, then weighed by its check; where there are none, little is spent."""
+"""Peaks that a run missed are found, then weighed and won back by its check; where there are none, little is spent."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ from nested_sampling import hard, problems
 
 from probewise.nested import NestedResult, SliceMove
 from probewise.nested.check import check_and_repeat, climb_to_top, find_missed_peaks, peak_of_last_live_points
-from probewise.nested.problem import Evaluator, Samplable
+from probewise.nested.clusters import Clusters
+from probewise.nested.moves import HoppingMove
+from probewise.nested.problem import Bound, Evaluator, Samplable
 from probewise.nested.sampler import run_once
 
 SHARE = 0.6
@@ -69,16 +71,25 @@ def test_a_mode_without_live_points_is_found_as_wide_as_it_is(robbed: NestedResu
     assert n_calls < robbed.n_calls / 3
 
 
-def test_a_lost_mode_is_a_doubt_that_says_how_much_it_holds(robbed: NestedResult) -> None:
-    """By a second estimate of the whole, whose posterior has 0.6 in the mode; its log Z is right to its error."""
+def test_a_lost_mode_is_won_back_by_hops_to_it(robbed: NestedResult) -> None:
     result = checked(robbed, Two(), 5.0)
+    assert not result.warnings
+    assert abs(result.log_z - Two().log_z) < 3.9 * result.log_z_error
+    # Hops hold the share of the live points in each mode: it scatters as that of independent ones.
+    assert abs(share_of_second(result) - SHARE) < 3.9 * math.sqrt(SHARE * (1 - SHARE) * result.information / 100)
+    assert result.n_calls <= 5 * robbed.n_calls
+
+
+def test_a_lost_mode_that_cannot_be_won_back_within_the_limit_is_a_doubt(robbed: NestedResult) -> None:
+    """By a second estimate of the whole, whose posterior has 0.6 in the mode; its log Z is right to its error."""
+    result = checked(robbed, Two(), 1.9)
     assert result.log_z == robbed.log_z
     assert result.check is not None
     assert abs(result.check.log_z - Two().log_z) < 3.9 * result.check.log_z_error
     (said,) = (note for note in result.warnings if "have lost or never met has a log Z of about" in note)
     weighed = float(said.split("about ")[1].split(",")[0])
     assert weighed == pytest.approx(result.check.log_z + math.log(SHARE), abs=0.5)
-    assert result.n_calls < 2.5 * robbed.n_calls  # it is not repeated: longer chains would not meet the mode
+    assert result.n_calls <= 1.9 * robbed.n_calls
 
 
 @pytest.mark.parametrize("name", ["Gaussian 4-D", "circle", "shells 2-D", "eggbox"])
@@ -113,3 +124,27 @@ def test_the_top_of_a_bent_peak_is_met_to_a_hundredth_of_a_nat() -> None:
     best = known.log_likelihood(np.ones((1, 2)))[0]
     assert best - 0.01 < top.log_likelihood <= best + 1e-9
     assert evaluate.n_calls < run.n_calls / 5
+
+
+def test_hops_hold_the_share_of_each_mode_and_reach_it_from_another() -> None:
+    """Above a bound two squares' areas are known: 0.04 and 0.01 of 0.05. Four sds, one false alarm in 16,000 each."""
+
+    def function(theta: np.ndarray) -> np.ndarray:
+        large, small = (np.abs(theta - at).max(axis=1) < half for at, half in ((0.3, 0.1), (0.8, 0.05)))
+        return np.where(large | small, 0.0, -1.0)
+
+    evaluate = Evaluator(problems.Known(problems.box(2, 0, 1), function, 0.0))
+    rng = np.random.default_rng(6)
+    modes = Clusters.from_groups(
+        [0.3 + 0.1 * rng.standard_normal((300, 2)), 0.8 + 0.05 * rng.standard_normal((300, 2))]
+    )
+    move = HoppingMove(SliceMove(hops=0, differences=0.0), modes)
+    now = evaluate(rng.uniform(0.2, 0.4, (2000, 2)), rng)
+    for _ in range(6):
+        now, tally = move.draw(now, Bound(-0.5, 0.0), now.u, evaluate, rng)
+    small = now.u[:, 0] > 0.6
+    assert abs(small.mean() - 0.2) < 4 * math.sqrt(0.2 * 0.8 / 2000)
+    assert (now.log_likelihood == 0.0).all()
+    assert tally.n_evaluated > 2000
+    inside = now.u[small] - 0.75
+    assert abs(inside.mean() - 0.05) < 4 * 0.1 / math.sqrt(12 * inside.size)

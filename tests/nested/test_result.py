@@ -62,6 +62,8 @@ def test_a_file_of_another_format_says_so_even_where_its_arrays_have_other_names
     with pytest.raises(FileError, match="log_z, mood missing or unknown"):
         NestedResult.load(path)
     head["log_z"] = result.log_z
+    np.savez(path, head=np.array(json.dumps({**head, "agreement": None})), **parts)  # as merged runs had
+    assert NestedResult.load(path).log_z == result.log_z
     for name, wrong in {"theta": np.zeros(0), "log_weight": np.array(np.nan), "parent": np.array("a")}.items():
         np.savez(path, head=np.array(json.dumps(head)), **{**parts, name: wrong})
         with pytest.raises(FileError, match=r"run\.npz: unusable: "):

@@ -136,11 +136,10 @@ def test_the_circle_is_white_up_to_its_radius():
 def test_scenes_name_their_parameters_and_give_their_regions():
     known = KnownScene({"disc": kinds.Disc((0.0, 0.0), 5.0)})
     assert known.names == ()
-    assert known.prior.names == ()
     assert known.regions(np.zeros((3, 0)))["disc"].n_regions == 1
     guessed = HypothesisScene(Circle())
     theta = draws(Circle(), 3)
-    assert guessed.names == ("x_mm", "y_mm", "radius_mm") == guessed.prior.names
+    assert guessed.names == ("x_mm", "y_mm", "radius_mm")
     regions = guessed.regions(theta)
     assert regions["any name"] is regions["another"]
     assert regions["field"].n_regions == 3

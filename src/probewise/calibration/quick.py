@@ -21,9 +21,15 @@ from functools import cached_property, partial
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
-from probewise.calibration.about_peaks import MOST_RELABELLED, distinct_peaks, laplace, weigh_draws_about_peaks
 from probewise.calibration.paper import OrderPosterior, ProblemsByOrder, Progress, Search
-from probewise.calibration.peaks import climb, starts_of_climbs
+from probewise.calibration.peaks import (
+    MOST_RELABELLED,
+    climb,
+    distinct_peaks,
+    laplace,
+    starts_of_climbs,
+    weigh_draws_about_peaks,
+)
 from probewise.calibration.priors import SSFPrior, view_by_kind_and_gaussian
 from probewise.errors import DoubtfulResultWarning
 from probewise.inference import SensorProblem

@@ -2,11 +2,11 @@
 
 Chains that are too short bias every shell a little in the same direction, which neither insertion ranks nor the scatter
 between seeds show. The second estimate uses chains twice as long and compresses by few nats: it runs from a prior near
-the posterior of the first run (`repartition`), or, where that saves nothing, is a small run of the same problem.
+the posterior of the first run (`repartitioned`), or, where that saves nothing, is a small run of the same problem.
 
 Parts of the posterior without live points escape both. So missed peaks are looked for first, from the run's dead points
 and its last live ones, and the prior of the second estimate gets a part about each: its posterior tells which of them
-matter.
+matter. The repetition hops between all parts.
 
 - Two modes shrink at the same rate until their tops are near, and over these tens of nats the number of live points in
   each drifts: a narrow mode that begins with a few may lose them all. But some points that died early lie in it. Where
@@ -32,7 +32,7 @@ from probewise.errors import NotConvergedError, ParameterError, message_of
 from probewise.nested.clusters import Clusters, find_clusters
 from probewise.nested.evidence import MOST_MEMORY, warning_of_few_lineages, warning_of_few_possible_draws
 from probewise.nested.importance import covariance_root_of_points, repartitioned, root_of_covariance
-from probewise.nested.moves import Move, SliceMove
+from probewise.nested.moves import HoppingMove, Move, SliceMove
 from probewise.nested.problem import Evaluator, Points, Samplable
 from probewise.nested.result import Check, NestedResult
 
@@ -287,12 +287,15 @@ class _Budget:
     def left(self) -> int:
         return int(self.limit - self.spent)
 
-    def run(self, problem: Samplable, n_live: int, chain: SliceMove) -> NestedResult | None:
-        """Run nested sampling; None if too few evaluations are left for a complete run."""
+    def run(
+        self, problem: Samplable, n_live: int, chain: SliceMove, modes: Clusters | None = None
+    ) -> NestedResult | None:
+        """Run nested sampling, with hops between `modes`; None if too few evaluations are left for a complete run."""
         # A run is worth a start with its first live points, and twice the evaluations of one round.
         if self.left < n_live * (1 + chain.n_steps(len(problem.prior.names)) * chain.target):
             return None
-        found = self.search(problem, n_live=n_live, move=chain, max_calls=self.left, rng=self.rng)
+        move = chain if modes is None else HoppingMove(chain, modes)
+        found = self.search(problem, n_live=n_live, move=move, max_calls=self.left, rng=self.rng)
         self.spent += found.n_calls
         return found if found.complete else None
 
@@ -360,7 +363,7 @@ def check_and_repeat(
     least_live: int,
     rng: np.random.Generator,
 ) -> NestedResult:
-    """Check a run that its stopping rule ended; repeat it with longer chains where the second estimate disagrees.
+    """Check a run that its stopping rule ended; repeat it with longer chains where there are doubts.
 
     Limits on all evaluations, those of `first` included: `max_cost` times those of `first`, and `max_calls`, if not
     None. `least_live`: fewest live points allowed for the problem. `evaluate`: of the problem, for the search of missed
@@ -382,8 +385,8 @@ def check_and_repeat(
             ]
         else:
             n_check, notes = budget.spent - first.n_calls, second.doubts(first)
-            if notes and not second.run.warnings and not second.missing_part_in_words(first):
-                again = budget.run(evaluate.problem, first.n_live, chain)
+            if notes and not second.run.warnings:
+                again = budget.run(evaluate.problem, first.n_live, chain, second.parts)
                 if again is not None and not again.warnings and not second.doubts(again):
                     now, notes = again, []
             log_z, error = second.run.log_z, second.run.log_z_error

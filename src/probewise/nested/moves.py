@@ -275,6 +275,7 @@ def _random_bracket(
 
 # With three steps in three dimensions the chains stay correlated: ln Z scattered by 1.3 of its claimed errors.
 _FEWEST_STEPS = 6
+_HOPS = 3
 _BLOCK = 4096  # proposals evaluated at a time: their predictions stay in the cache
 _DENSITY_BLOCK = 1024
 _MOST_KERNELS = 100
@@ -357,7 +358,7 @@ class SliceMove:
     width: float = 5.0  # of the bracket, in units of the live points' sd along the line
     axes: float = 0.7  # share of steps along axes
     differences: float = 0.1  # and along differences; the rest are along random directions
-    hops: int = 3  # more, where there are clusters
+    hops: int = _HOPS  # more, where there are clusters
     target: float = 2.5  # candidates of a step on average, to which the width is tuned
     fewest_steps: int = _FEWEST_STEPS
 
@@ -389,6 +390,52 @@ class SliceMove:
         """Return the move with its bracket width adapted towards `target` candidates per step."""
         excess = math.log(max(tally.n_tried, 1) / max(tally.n_accepted, 1) / self.target)
         return replace(self, width=min(max(self.width * math.exp(-0.5 * excess), 0.05), 20.0))
+
+
+@dataclass(frozen=True, eq=False)
+class HoppingMove:
+    """A move that hops between modes, then runs the chains of `chains`, so that no mode dies out among the live points.
+
+    A hop takes a point to its counterpart in another mode, by the affine map between their covariances, and is accepted
+    with the ratio of their volumes (see `SliceMove`). `SliceMove` knows only the modes with enough live points for a
+    covariance; here `modes` are clusters of the posterior, in the sampling coordinates. Level sets of a mode keep about
+    the same shape far below its top, so the maps serve from where modes separate.
+    """
+
+    chains: SliceMove
+    modes: Clusters
+
+    def draw(
+        self, start: Points, bound: Bound, live: FloatArray, evaluate: Evaluator, rng: np.random.Generator
+    ) -> tuple[Points, Tally]:
+        """Return the ends of one chain from each start, and the tally; see `Move`."""
+        n_before, now = evaluate.n_calls, start.copy()
+        for _ in range(_HOPS):
+            self._hop_in_place(now, bound, evaluate, rng)
+        n_hops = evaluate.n_calls - n_before
+        new, tally = self.chains.draw(now, bound, live, evaluate, rng)
+        return new, replace(tally, n_evaluated=tally.n_evaluated + n_hops)
+
+    def _hop_in_place(self, now: Points, bound: Bound, evaluate: Evaluator, rng: np.random.Generator) -> None:
+        """Try one hop of each point to a mode chosen at random from the others; overwrite the points that succeed."""
+        modes = self.modes
+        home = modes.assign(now.u)
+        goal = (home + rng.integers(1, len(modes), size=len(home))) % len(modes)
+        u, log_growth = modes.map_with_log_volume_ratio(now.u, home, goal)
+        # The way back must be the same map.
+        able = evaluate.space.inside_mask(u) & (modes.assign(u) == goal)
+        level = now.log_density - log_growth - rng.standard_exponential(len(home))
+        rows = able.nonzero()[0]
+        theta, log_density = evaluate.space.leave(u[rows])
+        dense = (log_density >= level[rows]).nonzero()[0]
+        rows = rows[dense]
+        tried = evaluate.evaluate_mapped(u[rows], theta[dense], log_density[dense], rng)
+        won = bound.mask_above(tried.log_likelihood, tried.label).nonzero()[0]
+        now.overwrite_rows(rows[won], tried, won)
+
+    def adapted(self, tally: Tally) -> HoppingMove:
+        """Return the move with its chains adapted; see `SliceMove`."""
+        return HoppingMove(self.chains.adapted(tally), self.modes)
 
 
 class Kernels:

@@ -432,6 +432,7 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
         seed_state=json.dumps(seeds),
         versions=software_versions(),
         warnings=(*doubts, *inherited),
+        check=None,
     )
 
 

@@ -178,7 +178,7 @@ def run(
         Limit of likelihood evaluations; at the limit the run ends with a warning.
     max_cost
         Limit of all evaluations in units of those of the first run; 1 means no check. Else the evidence is estimated a
-        second time, and the run repeated where the two disagree (`probewise.nested.check`); what
+        second time, and the run repeated where the two disagree or a mode was lost (`probewise.nested.check`); what
         remains in doubt is a warning.
     checkpoint
         File to which the state is saved atomically, at most once in ten seconds and ten times the saving time; its
@@ -274,10 +274,10 @@ def run_once(
     `probewise.nested.run` documents the parameters and errors; here doubts are stored in the result without a warning.
     """
     require_rng(rng)
-    if stop is not None:
-        require_callable("stop", stop, "a rule such as RemainingEvidence(dlogz=0.1), of probewise.nested, or None")
-    if move is not None:
-        require_like("move", move, ("draw", "adapted"), "a move such as SliceMove(), of probewise.nested, or None")
+    rule = RemainingEvidence() if stop is None else stop
+    moving: Move = SliceMove() if move is None else move
+    require_callable("stop", rule, "a rule such as RemainingEvidence(dlogz=0.1), of probewise.nested, or None")
+    require_like("move", moving, ("draw", "adapted"), "a move such as SliceMove(), of probewise.nested, or None")
     if progress is not None:
         allowed = "a function called with a RoundSummary after every round, or None; a run shows no bar by itself"
         require_callable("progress", progress, allowed)
@@ -300,9 +300,7 @@ def run_once(
     require(1 <= n_replaced <= n_live // 2, "n_replaced", n_replaced, f"1 to n_live / 2 = {n_live // 2}")
     if max_calls is not None and checked_whole("max_calls", max_calls, least=None, most=None) < n_live:
         raise ParameterError("max_calls", max_calls, f"n_live = {n_live} or more")
-    rule = RemainingEvidence() if stop is None else stop
     seed_state = json.dumps(rng.bit_generator.state, default=as_json)
-    moving: Move = SliceMove() if move is None else move
     if n_params == 0:
         only = np.empty((1, 0))
         log_likelihood = evaluate.log_likelihood(only)

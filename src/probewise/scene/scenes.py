@@ -13,7 +13,6 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise._kinds import checked_number, require_kind
 from probewise.errors import require
-from probewise.priors import Prior, Product
 from probewise.recordings.columns import require_patterns
 from probewise.recordings.patterns import Pattern
 from probewise.scene.regions import PolygonRegion, Region, edge_distance, outlines, region_of
@@ -47,10 +46,6 @@ class KnownScene:
     def names(self) -> tuple[str, ...]:
         return ()
 
-    @property
-    def prior(self) -> Prior:
-        return Product({})
-
     def regions(self, theta: FloatArray) -> Mapping[str, Region]:
         return self._region_by_name
 
@@ -72,10 +67,6 @@ class HypothesisScene:
     def names(self) -> tuple[str, ...]:
         return self.shape.prior.names
 
-    @property
-    def prior(self) -> Prior:
-        return self.shape.prior
-
     def regions(self, theta: FloatArray) -> Mapping[str, Region]:
         """Return, for any pattern name, the regions of the hypotheses, one per row of theta (n_samples, n_params)."""
         return OneRegionForAllNames(self.shape.region(theta))
@@ -88,6 +79,7 @@ class OneRegionForAllNames(Mapping[str, Region]):
     region: Region
 
     def __getitem__(self, name: str) -> Region:
+        require(isinstance(name, str), "pattern name", name, "a text")
         return self.region
 
     def __iter__(self) -> Iterator[str]:

@@ -59,9 +59,6 @@ VOCABULARY: Mapping[str, LightEffect] = _by_name(
 )
 """Every effect that the diagnosis considers, by name."""
 
-SINCE_CALIBRATION = (reading.dark_level, reading.gain)
-"""Changes of the levels since the calibration, constant in a recording: seen only beside a sensor that is known."""
-
 RARE_EFFECTS: Mapping[str, LightEffect] = _by_name(
     pose.arm_knock,
     reading.gain_jump,
@@ -124,7 +121,6 @@ __all__ = [
     "OTHER_FORMS",
     "PROPOSAL",
     "RARE_EFFECTS",
-    "SINCE_CALIBRATION",
     "VOCABULARY",
     "Effect",
     "Estimated",

@@ -21,19 +21,18 @@ from probewise._arrays import FloatArray
 from probewise._words import value_with_sd
 from probewise.arm.instrument import Reading
 from probewise.effects import (
-    SINCE_CALIBRATION,
-    VOCABULARY,
     Effect,
     Extent,
     HeavyTailedPrior,
     LightEffect,
     LogHeavyTailedPrior,
     light_effect,
+    optics,
+    pose,
+    reading,
 )
 from probewise.effects.effect import WrappedEffect
 from probewise.effects.optics import PatchPrior
-from probewise.effects.pose import play_of_axes
-from probewise.effects.reading import gain_drift
 from probewise.errors import ParameterError
 from probewise.experiment.noise_rivals import DeclaredNoise, noise_likelihoods
 from probewise.inference.problem import Likelihood
@@ -42,30 +41,6 @@ from probewise.recordings.plan import Instrumentation, Plan
 from probewise.sensor import Chain, FixedLevels
 from probewise.sensor.chain import cards_of
 from probewise.sensor.stages import AnyEffect, Poses, SensorModel, Stage
-
-ON_FIELD = {
-    "ambient_gradient": True,
-    "ambient_step": False,
-    "offset_drift": False,
-    "gain_drift": False,
-    "saturation": False,
-    "nonlinearity": False,
-    "albedo_gradient": True,
-    "hysteresis": False,
-    "lag": False,
-    "backlash": False,
-    "edge_blur": False,
-    "edge_shadow": False,
-    "halo": False,
-    "periodic_position_error": False,
-    "height_gradient": True,
-    "albedo_patch": True,
-    "glint": True,
-}
-"""Effects on the mean that are detectable over a shape on a field, and whether their scale is the field's."""
-
-WITH_CARDS = {"sensor_tilt": False, "position_scale": True}
-"""Effects that are aliased with another shape, unless there is a card at a known place."""
 
 OF_MOTION = frozenset({"backlash", "hysteresis"})
 """Effects of the direction from which the arm comes."""
@@ -111,16 +86,12 @@ def rivals_of(
         )
     dark, bright = model.levels.i_min, model.levels.i_max
     carried = {effect.name for effect in model.effects}
-    rivals, with_cards = list[SensorModelRival](), bool(cards_of(model))
-    candidates = [(VOCABULARY[name], wide) for name, wide in (ON_FIELD | (WITH_CARDS if with_cards else {})).items()]
-    candidates += [(kind, False) for kind in (LEVELS_CHANGED if with_cards else ONLY_IN_RUNS)]
-    for kind, wide in candidates:
-        plan = _plan_there_and_back(math.hypot(*field_mm) if wide else _SCAN_MM, height_mm)
-        extent = Extent(min(dark, bright), max(dark, bright), plan)
-        effect = kind.for_extent(extent)
+    rivals = []
+    for kind in (*ON_FIELD, *(WITH_CARDS if cards_of(model) else WITHOUT_CARDS)):
+        plan = _plan_there_and_back(math.hypot(*field_mm) if kind in _OF_WHOLE_FIELD else _SCAN_MM, height_mm)
+        effect = kind.for_extent(Extent(min(dark, bright), max(dark, bright), plan))
         if effect is not None and carried.isdisjoint(kind.name.split("+")):
-            ways = _forms_of_effect_in_run(effect, extent, field_mm)
-            rivals += [SensorModelRival(kind.name, effect=way) for way in ways]
+            rivals += [SensorModelRival(kind.name, effect=way) for way in _ways_in_run(effect, field_mm)]
     noise = DeclaredNoise.from_likelihood(likelihood)
     if noise is not None:
         rivals += [
@@ -129,20 +100,12 @@ def rivals_of(
     return tuple(rivals)
 
 
-def _forms_of_effect_in_run(effect: Effect, extent: Extent, field_mm: tuple[float, float]) -> list[DescribedEffect]:
-    """Return the forms in which an effect may act in a run, with a run's prior; effects of time act in paced time."""
+def _ways_in_run(effect: Effect, field_mm: tuple[float, float]) -> list[DescribedEffect]:
+    """Return the ways in which an effect may act in a run, with a run's prior; effects of time act in paced time."""
     in_run = EffectWithRunPrior(effect, field_mm)
-    if effect.name == "backlash":
-        of_axes = EffectWithRunPrior(cast(Effect, play_of_axes.for_extent(extent)), field_mm)
-        return [in_run, FromRest(in_run), of_axes, FromRest(of_axes)]
     if effect.name in OF_MOTION:
         return [in_run, FromRest(in_run)]
-    if effect.name not in _IN_TIME:
-        return [in_run]
-    forms: list[DescribedEffect] = [EffectInPacedTime(in_run)]
-    if effect.name == "gain_drift":
-        forms.append(EffectInPacedTime(EffectWithRunPrior(cast(Effect, gain_loss.for_extent(extent)), field_mm)))
-    return forms
+    return [EffectInPacedTime(in_run) if effect.name in _IN_TIME else in_run]
 
 
 def _plan_there_and_back(length_mm: float, height_mm: float | None) -> Plan:
@@ -177,7 +140,7 @@ def gain_loss(kind: LightEffect, of: Extent) -> Effect:
             "the first minute of this: the lamp or its battery changes"
         )
 
-    return replace(cast(Effect, gain_drift.build(kind, of)), apply=act, sentence=says)
+    return replace(cast(Effect, reading.gain_drift.build(kind, of)), apply=act, sentence=says)
 
 
 @light_effect("position_scale", Stage.POSE, "a wrong scale of one axis", ("place", "slope"))
@@ -207,23 +170,56 @@ def _scale_of_axis(kind: LightEffect, of: Extent, axis: str, other: str) -> Effe
 @light_effect("dark_level+gain", Stage.GAIN, "other levels than at the calibration", ("level",))
 def dark_level_and_gain(kind: LightEffect, of: Extent) -> Effect:
     """Return both changes since the calibration at once, as on another day: signal x (1 + frac) + offset."""
-    dark, gain = (cast(Effect, form.for_extent(of)) for form in SINCE_CALIBRATION)
+    level, signal = (cast(Effect, form.for_extent(of)) for form in (reading.dark_level, reading.gain))
 
     def act(value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        return np.asarray(dark.apply(gain.apply(value, theta[:, 1:], plan), theta[:, :1], plan))
+        return np.asarray(level.apply(signal.apply(value, theta[:, 1:], plan), theta[:, :1], plan))
 
     def says(mean: FloatArray, sd: FloatArray) -> str:
-        return f"{dark.sentence(mean[:1], sd[:1])}; and {gain.sentence(mean[1:], sd[1:])}"
+        return f"{level.sentence(mean[:1], sd[:1])}; and {signal.sentence(mean[1:], sd[1:])}"
 
-    priors = {**dark.marginals, **gain.marginals}
+    priors = {**level.marginals, **signal.marginals}
     return kind.bind(of, {name: (prior, "") for name, prior in priors.items()}, act, np.zeros((0, 1, 2)), says)
 
 
-LEVELS_CHANGED = (*SINCE_CALIBRATION, dark_level_and_gain)
-"""Changes of the levels since the calibration, one or both."""
+LEVELS_CHANGED = (reading.dark_level, reading.gain, dark_level_and_gain)
+"""Changes of the levels since the calibration, one or both, constant in a run."""
 
-ONLY_IN_RUNS = (*LEVELS_CHANGED, scale_of_x, scale_of_y)
-"""Effects that only a run without cards has as rivals, besides those in `ON_FIELD`."""
+ON_FIELD = (
+    reading.ambient_gradient,
+    reading.ambient_step,
+    reading.offset_drift,
+    reading.gain_drift,
+    gain_loss,
+    reading.saturation,
+    reading.nonlinearity,
+    optics.albedo_gradient,
+    reading.hysteresis,
+    reading.lag,
+    pose.backlash,
+    pose.play_of_axes,
+    optics.edge_blur,
+    optics.edge_shadow,
+    optics.halo,
+    pose.periodic_position_error,
+    optics.height_gradient,
+    optics.albedo_patch,
+    optics.glint,
+)
+"""Effects on the mean that are detectable over a shape on a field, each form of one by itself."""
+
+WITH_CARDS = (pose.sensor_tilt, pose.position_scale, *LEVELS_CHANGED)
+WITHOUT_CARDS = (*LEVELS_CHANGED, scale_of_x, scale_of_y)
+"""Further ones: a tilt and a scale of both axes are aliased with another shape, unless a card is at a known place."""
+
+_OF_WHOLE_FIELD = (  # their scale is the field's
+    reading.ambient_gradient,
+    optics.albedo_gradient,
+    optics.height_gradient,
+    optics.albedo_patch,
+    optics.glint,
+    pose.position_scale,
+)
 
 
 class DescribedEffect(AnyEffect, Protocol):

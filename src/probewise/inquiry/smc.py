@@ -217,7 +217,7 @@ def update(
         given_up = n_temperatures >= effort.most_temperatures
         stuck |= all_at_once == 0.0 or (given_up and all_at_once < least)
         if stuck and fall_back is not None:
-            return particles_from_posterior(fall_back(), n, problem, n_calls=n_calls, rng=rng)
+            return particles_from_run(fall_back(), n, problem, n_calls=n_calls, rng=rng)
         if all_at_once == 0.0:
             return replace(previous.with_zero_evidence(), strained=True)
         strained |= stuck
@@ -289,20 +289,21 @@ def resample_and_move(
 
 
 def particles_from_posterior(
-    found: Weighted | NestedResult,
-    n: int,
-    problem: SequentialProblem,
-    *,
-    n_calls: int = 0,
-    rng: np.random.Generator,
-    effort: UpdateSettings = THOROUGH,
+    found: Weighted, n: int, problem: SequentialProblem, *, rng: np.random.Generator, effort: UpdateSettings = THOROUGH
 ) -> Particles:
-    """Restart with `n` samples drawn from a posterior and moved apart, with that posterior's evidence."""
-    start = _EvaluatedSamples.of(found.samples(n, rng=rng), problem, 1.0)
-    run = found if isinstance(found, NestedResult) else found.run
-    n_calls += found.n_calls + n
-    drawn = _moved_apart(start, found, problem, n_calls=n_calls, run=run, rng=rng, effort=effort)
+    """Restart with `n` samples resampled from a posterior and moved apart, with that posterior's evidence."""
+    start = _EvaluatedSamples.of(found.theta[resampled_rows(found.weight, n, rng)], problem, 1.0)
+    drawn = _moved_apart(start, found, problem, n_calls=found.n_calls + n, run=found.run, rng=rng, effort=effort)
     return Particles(drawn, np.arange(n), found.log_z_error**2)
+
+
+def particles_from_run(
+    run: NestedResult, n: int, problem: SequentialProblem, *, n_calls: int, rng: np.random.Generator
+) -> Particles:
+    """Start from a nested sampling run: resample `n` samples from it, and move them apart."""
+    start = _EvaluatedSamples.of(run.samples(n, rng=rng), problem, 1.0)
+    drawn = _moved_apart(start, run, problem, n_calls=n_calls + run.n_calls + n, run=run, rng=rng, effort=THOROUGH)
+    return Particles(drawn, np.arange(n), run.log_z_error**2)
 
 
 def _moved_apart(

@@ -229,6 +229,8 @@ def test_two_investigations_do_not_mix(tmp_path):
         begin({"seed": 1}, resume=False)
     with pytest.raises(FileError, match="seed 1"):
         begin({"seed": 2}, resume=True)
+    with pytest.raises(FileError, match="an investigation with another plan; allowed"):
+        begin({"seed": 1, "plan": "a61760525c3b"}, resume=True)
     (tmp_path / "rounds" / "settings.json").write_text("[1]")
     with pytest.raises(FileError, match="no JSON object"):
         begin({"seed": 1}, resume=True)

@@ -30,8 +30,9 @@ def progress_shown(*, quiet: bool, beat: bool = True, lines: bool = True) -> Ite
     `beat` updates the elapsed time between reports; False while the program prompts at the same terminal. Without
     `lines` nothing is written where standard error is neither a terminal nor a notebook.
     """
-    looked_at = sys.stderr.isatty() or "ipykernel" in sys.modules
-    if quiet or not (looked_at or lines):
+    stream = sys.stderr  # None in a program without a console, such as IDLE or pythonw
+    looked_at = "ipykernel" in sys.modules or (stream is not None and stream.isatty())
+    if quiet or stream is None or not (looked_at or lines):
         yield silent
         return
     shown = _StageBars() if looked_at else _TextProgress()

@@ -25,7 +25,7 @@ from probewise.arm import Reading, readings_of_recording, recording_of_readings
 from probewise.diagnosis import SETTLED, Diagnosis, SensorPrior, diagnose
 from probewise.diagnosis.words import hypothesis_in_words
 from probewise.effects import VOCABULARY, LightEffect
-from probewise.errors import FileError, ParameterError, did_you_mean, require
+from probewise.errors import FileError, ParameterError, did_you_mean, require, shown
 from probewise.progress import Progress, silent
 from probewise.recordings import (
     parse_json_file_text,
@@ -254,7 +254,10 @@ class RoundsFolder:
             raise FileError(file, "no JSON object", _ALLOWED)
         for name, value in self._settings.items():
             if before.get(name) != value:
-                raise FileError(file, f"an investigation with {name} {before.get(name)!r}", f"{value!r}, as asked now")
+                found, allowed = f"{name} {shown(before.get(name))}", f"{shown(value)}, as asked now"
+                if name in ("plan", "sensor"):  # their digests say nothing to a person
+                    found, allowed = f"another {name}", f"the {name} that it was begun with, or another --out"
+                raise FileError(file, f"an investigation with {found}", allowed)
 
     def record_round(
         self, number: int, plan: Plan, asked: str, *, take: Take, progress: Progress = silent

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from probewise.cli import main
+from probewise.cli._executor import worker_pool
+from probewise.errors import NotConvergedError
 from probewise.report import each
 
 LINE = (
@@ -39,7 +41,13 @@ def test_each_recording_has_a_row_and_a_folder_and_is_diagnosed_once(tmp_path, m
     page = (out / "report.html").read_text()
     assert page.index("b/report.html") < page.index("a/report.html")
     monkeypatch.setattr("probewise.cli.diagnose._diagnosed", lambda words: pytest.fail("diagnosed again"))
-    assert main([*given[:3], *given[4:]]) == 0  # without the one that was refused
+    again = [*given[:3], *given[4:]]  # without the one that was refused
+    assert main(again) == 0
+    monkeypatch.setattr("probewise.cli.diagnose._diagnosed", lambda words: ("again", {}))
+    for damaged in ("{", "[]", "{}"):
+        (out / "a" / "diagnosis.json").write_text(damaged)
+        assert main(again) == 0
+        assert "a,refused,,,,,again" in (out / "table.csv").read_text().splitlines()
     assert main(["diagnose", files[0], "--out", str(out), "--workers", "2"]) == 2
     assert "for --each" in capsys.readouterr().err
 
@@ -65,7 +73,19 @@ def test_names_that_cannot_name_a_folder_and_one_with_other_results_are_refused(
     for name, said in (("...csv", "another name"), ("..csv", "another name"), ("b.csv", "holds a fit")):
         assert main(["diagnose", write_line(tmp_path / name), *given]) == 2
         assert said in capsys.readouterr().err
-    assert {path.name for path in tmp_path.iterdir()} == {"out", "line.py", "b.csv", "..csv", "...csv"}
+    (tmp_path / "elsewhere").mkdir()
+    (out / "c").symlink_to(tmp_path / "elsewhere")
+    assert main(["diagnose", write_line(tmp_path / "c.csv"), *given]) == 2
+    assert "c: is a symbolic link, which may lead out of the folder" in capsys.readouterr().err
+    assert not any((tmp_path / "elsewhere").iterdir())
+    here = {path.name for path in tmp_path.iterdir()}
+    assert here == {"out", "elsewhere", "line.py", "b.csv", "c.csv", "..csv", "...csv"}
+
+
+def test_a_process_that_dies_is_said_in_words():
+    """As one that the system ends for want of memory."""
+    with pytest.raises(NotConvergedError, match="a worker process has died"), worker_pool(1) as pool:
+        pool.submit(os._exit, 1).result()
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no pipes with names")

@@ -103,6 +103,12 @@ def test_a_quiet_command_says_nothing(hurried, capsys):
     assert capsys.readouterr().err == ""
 
 
+def test_a_program_without_a_console_shows_nothing(monkeypatch):
+    monkeypatch.setattr("sys.stderr", None)
+    with progress_shown(quiet=False) as progress:
+        assert progress is silent
+
+
 def test_nothing_beats_where_a_person_is_asked(hurried, capsys):
     with progress_shown(quiet=False, beat=False) as progress:
         time.sleep(0.05)

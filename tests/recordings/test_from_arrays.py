@@ -86,6 +86,12 @@ def test_sessions_are_written_read_back_and_made_from_a_table(tmp_path):
     assert made(scan=[*"aab"], session=[2, 2, 2]).plan.sessions == ()
 
 
+def test_scans_that_are_named_by_numbers_get_a_note_that_1_10_is_1_1():
+    (note,) = made(scan=[1.1, 1.1, 2.0]).notes
+    assert note.startswith("column scan names scans by numbers, of which 1.10 is 1.1")
+    assert not made(scan=["1.1", "1.10", "2"]).notes
+
+
 def test_scans_begin_where_their_name_changes_and_times_are_a_second_apart():
     plan = made(scan=[1, 2, 1]).plan
     assert (plan.scan.tolist(), plan.scan_names) == ([0, 1, 2], ("1", "2", "1"))
@@ -148,6 +154,9 @@ def test_dates_with_and_without_a_time_zone_are_refused_together():
         ({"x_mm": ["a", "b", "c"]}, "x_mm is .*; allowed: numbers, in an array or a list"),
         ({"x_mm": [0, 1, 10**400]}, "x_mm is .*; allowed: numbers, in an array or a list"),
         ({"x_mm": [[0], [1, 2], 3]}, "x_mm is .*; allowed: numbers, in an array or a list"),
+        ({"reading": [0, 1e300, 1]}, r"reading\[1\] is 1e\+300; allowed: magnitudes up to 1e\+15"),
+        ({"y_mm": [0, 1, -1e10]}, r"y_mm\[2\] is -10000000000.0; allowed: magnitudes up to 1e\+09"),
+        ({"temperature": [0, 1e16, 1]}, r"temperature\[1\] is 1e\+16; allowed: magnitudes up to 1e\+15"),
         ({"reading": [0, 1, 1j]}, "reading is .*; allowed: numbers, in an array or a list"),
         ({"x_mm": [0, 1], "y_mm": [0, 1, 2]}, r"x_mm has shape \(2,\); allowed: \(3,\), one per reading"),
         ({"pattern": ["edge", None, "edge"]}, r"pattern\[1\] is None; allowed: a name in every row"),

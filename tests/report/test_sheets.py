@@ -198,6 +198,9 @@ def test_the_command_writes_the_pages_and_refuses_what_it_cannot_draw(tmp_path, 
         assert not (tmp_path / "no.pdf").exists()
 
 
-def test_a_sheet_of_thousands_of_pages_is_refused():
+def test_a_sheet_of_thousands_of_pages_or_of_stripes_that_no_printer_draws_is_refused():
+    """A page had 200,000 stripes of a micrometre."""
+    with pytest.raises(ParameterError, match=r"period_mm of fine is 0.001; allowed: 0.1 or more"):
+        tiles_of(Sheet("fine", Stripes(0.0, 0.001, 0.5, 0.0), (0.0, 0.0), (100.0, 100.0)), "a4")
     with pytest.raises(ParameterError, match="a sheet of 400 pages at most"):
         tiles_of(Sheet("huge", Uniform(0.0), (0.0, 0.0), (1e5, 1e5)), "a4")

@@ -10,7 +10,7 @@ import signal
 import threading
 import warnings
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor
 from contextlib import AbstractContextManager
 from functools import partial
 from multiprocessing import resource_tracker
@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, TypeVar
 from probewise._signals import reporting_what_is_kept
 from probewise._writing import Drawings, Output
 from probewise.cli._common import finish, message_to_resume, progress_of
-from probewise.errors import DoubtfulResultWarning, LinkError
+from probewise.errors import DoubtfulResultWarning, LinkError, NotConvergedError
 
 if TYPE_CHECKING:
     from probewise.proof.campaign import Campaign, Result
@@ -89,7 +89,7 @@ def _cluster_executor(address: str) -> Iterator[Executor]:
 def worker_pool(n: int) -> Iterator[ProcessPoolExecutor]:
     """Yield a pool of `n` processes with one thread of linear algebra each; if the block raises, end the processes.
 
-    They are spawned, not forked, for the same behaviour on every system.
+    They are spawned, not forked, for the same behaviour on every system. NotConvergedError if one dies.
     """
     for name in THREAD_VARIABLES:
         os.environ.setdefault(name, "1")
@@ -97,10 +97,13 @@ def worker_pool(n: int) -> Iterator[ProcessPoolExecutor]:
     pool = ProcessPoolExecutor(n, mp_context=multiprocessing.get_context("spawn"), initializer=_initialise_worker)
     try:
         yield pool
-    except BaseException:
+    except BaseException as error:
         pool.shutdown(wait=False, cancel_futures=True)
         for child in multiprocessing.active_children():
             child.terminate()
+        if isinstance(error, BrokenExecutor):
+            why = f"a worker process has died, by a signal or for want of memory ({error})"
+            raise NotConvergedError(why) from error
         raise
     pool.shutdown()
 

@@ -125,25 +125,29 @@ def _diagnose_each(arguments: argparse.Namespace) -> int:
     """
     from probewise.report import each as report
 
-    out = checked_output_directory(arguments.out, main="counts.svg")
     files = dict(zip(_device_names(arguments.recordings), arguments.recordings, strict=True))
+    out = checked_output_directory(arguments.out, *files, main="counts.svg")
     for name in files:
         checked_output_directory(out / name, main="diagnosis.json")
     fingerprints = {name: _fingerprint(arguments, file) for name, file in files.items()}
 
-    def is_done(name: str) -> bool:
-        with contextlib.suppress(OSError):
-            return (out / name / _INPUTS).read_text() == fingerprints[name]
-        return False
+    def row_if_done(name: str) -> DeviceRow | None:
+        with contextlib.suppress(OSError, ValueError, LookupError, TypeError):  # a damaged diagnosis is made again
+            if (out / name / _INPUTS).read_text() == fingerprints[name]:
+                return _row(name, out / name)
+        return None
 
     given = [(name, getattr(arguments, name)) for name in ("sensor", "simulator")]
     options = [word for name, path in given if path is not None for word in (f"--{name}", str(path.absolute()))]
     options += ["--seed", str(arguments.seed), *(["--thorough"] if arguments.thorough else [])]
-    words = {name: [str(file.absolute()), *options] for name, file in files.items() if not is_done(name)}
+    words = {name: [str(file.absolute()), *options] for name, file in files.items() if row_if_done(name) is None}
     read = [*arguments.recordings, *(path for _, path in given if path is not None)]
     n_before, refused, notes = len(files) - len(words), dict[str, str](), list[str]()
 
-    kept = partial(message_to_resume, out, lambda: sum(map(is_done, files)), "recording", arguments, of=len(files))
+    def n_done() -> int:
+        return sum(row_if_done(name) is not None for name in files)
+
+    kept = partial(message_to_resume, out, n_done, "recording", arguments, of=len(files))
     with (
         reporting_what_is_kept(kept),
         progress_of(arguments) as progress,
@@ -162,10 +166,7 @@ def _diagnose_each(arguments: argparse.Namespace) -> int:
             if message:
                 refused[name] = message
             progress("diagnosing", done, len(files), name)
-    rows = [
-        _row(name, out / name) if is_done(name) else report.DeviceRow(name, "refused", says=refused[name])
-        for name in files
-    ]
+    rows = [row_if_done(name) or report.DeviceRow(name, "refused", says=refused[name]) for name in files]
     drawings = Drawings(out)
     made = Output(
         lambda stage: stage.write("table.csv", csv_text(report.columns_of(rows))),

@@ -249,6 +249,13 @@ def text_of_name(value: object) -> str:
     return number_text(value) if isinstance(value, float) else str(value)
 
 
+def notes_on_numbers_as_names(column: str, values: object, named: str) -> list[str]:
+    """Return a note if a column names runs, scans or patterns by numbers that are not whole; else none."""
+    if not any(isinstance(value, float) and value % 1 > 0 for value in np.ravel(np.asarray(values, dtype=object))):
+        return []
+    return [f"column {column} names {named} by numbers, of which 1.10 is 1.1; read it as text if they are two"]
+
+
 def _checked_name(what: str, text: str) -> str:
     """Return a name without surrounding blanks, as in a file; raise ParameterError if it is not printable."""
     require(text.strip().isprintable(), what, text, "a printable text, without line ends")

@@ -36,7 +36,15 @@ from probewise.recordings.columns import (
 from probewise.recordings.io import image_bytes, is_file_name_without_path, parse_json_file_text, read_image, read_text
 from probewise.recordings.patterns import PATTERNS, Image, Pattern
 from probewise.recordings.plan import Instrumentation, Plan, Recording, range_in_words, require_plan, require_recording
-from probewise.recordings.table import LARGEST, CSVTable, cell_in_words, csv_text, number_text, read_table
+from probewise.recordings.table import (
+    LARGEST,
+    LARGEST_PLACE_MM,
+    CSVTable,
+    cell_in_words,
+    csv_text,
+    number_text,
+    read_table,
+)
 
 FORMAT = "recording/1"
 _CONTROLS = ("orientation_deg", "height_mm", "led", "speed")
@@ -213,7 +221,6 @@ def _pattern_fields(pattern: Pattern) -> dict[str, object]:
 
 
 _KNOWN = ("reading", "x_mm", "y_mm", "orientation_deg", "scan", "pattern", "time_s")
-_LARGEST_PLACE_MM = 1e9
 _OF_A_LIGHT_SENSOR = (
     "a header row with it, in a recording by a light sensor; a table of anything else needs --simulator FILE.py"
 )
@@ -290,8 +297,8 @@ def plan_columns(plan: Plan) -> dict[str, Sequence[str]]:
     columns: dict[str, Sequence[str]] = {
         "scan": [names[k] for k in plan.scan],
         "pattern": [plan.pattern_names[k] for k in plan.pattern],
-        "x_mm": _number_cells("x_mm", plan.x_mm, _LARGEST_PLACE_MM),
-        "y_mm": _number_cells("y_mm", plan.y_mm, _LARGEST_PLACE_MM),
+        "x_mm": _number_cells("x_mm", plan.x_mm, LARGEST_PLACE_MM),
+        "y_mm": _number_cells("y_mm", plan.y_mm, LARGEST_PLACE_MM),
         "orientation_deg": [degrees[k] for k in which.reshape(-1).tolist()],
         "time_s": _number_cells("time_s", plan.time_s),
     }
@@ -377,8 +384,8 @@ def _read_with_json(path: object, progress: Progress) -> tuple[Plan, FloatArray 
     except ParameterError as error:
         raise _error_in_table(table, error, list(patterns)) from error
     plan = Plan(
-        x_mm=table.column_of_numbers("x_mm", largest=_LARGEST_PLACE_MM),
-        y_mm=table.column_of_numbers("y_mm", largest=_LARGEST_PLACE_MM),
+        x_mm=table.column_of_numbers("x_mm", largest=LARGEST_PLACE_MM),
+        y_mm=table.column_of_numbers("y_mm", largest=LARGEST_PLACE_MM),
         orientation_rad=np.radians(orientation_deg),
         time_s=time_s,
         scan=scan,

@@ -33,6 +33,7 @@ from probewise.recordings.columns import (
     checked_covariates,
     columns_by_name,
     how_to_describe_pattern,
+    notes_on_numbers_as_names,
     numbers_per_reading,
     numeric_covariates_and_notes,
     pattern_codes,
@@ -43,6 +44,7 @@ from probewise.recordings.columns import (
     texts_to_numbers,
 )
 from probewise.recordings.patterns import Pattern
+from probewise.recordings.table import LARGEST, LARGEST_PLACE_MM
 
 
 @dataclass(frozen=True)
@@ -409,7 +411,16 @@ class Recording(ShowsItself):
         recording = cls(plan, readings, source)
         if not recording.usable.any():
             raise ParameterError("reading", readings.tolist(), "at least one number within the declared range")
-        return replace(recording, notes=(*notes, *recording.notes_on_unusable_readings()))
+        numbers = {"reading": np.where(recording.usable, readings, 0.0), "time_s": plan.time_s, **plan.covariates}
+        places = {"x_mm": plan.x_mm, "y_mm": plan.y_mm}
+        for part, largest in ((numbers, LARGEST), (places, LARGEST_PLACE_MM)):  # as of a file
+            for name, values in part.items():
+                k = int(np.argmax(np.where(np.isfinite(values), np.abs(values), 0.0)))
+                is_moderate = not np.isfinite(values[k]) or abs(values[k]) <= largest
+                require(is_moderate, f"{name}[{k}]", float(values[k]), f"magnitudes up to {largest:g}")
+        names = [name for name in ("scan", "pattern") if name in columns]
+        of_names = [note for name in names for note in notes_on_numbers_as_names(name, columns[name], f"{name}s")]
+        return replace(recording, notes=(*notes, *of_names, *recording.notes_on_unusable_readings()))
 
     def __len__(self) -> int:
         return len(self.plan)

@@ -37,6 +37,7 @@ from probewise.recordings.cells import (
 from probewise.recordings.io import read_text
 
 LARGEST = 1e15
+LARGEST_PLACE_MM = 1e9
 """Largest magnitude of a number in a file: beyond, squares and differences lose all precision."""
 
 _BEGIN_FORMULA = ("=", "+", "-", "@")

@@ -30,6 +30,7 @@ CROSS_MM = 15.0  # half of a cross: long enough to show beyond a block of two LE
 AROUND_MM = 40.0  # margin beyond the outermost reading, which the sensor still sees
 PATTERN_FRAME = "the pattern's origin"
 _MOST_PAGES = 400
+_FINEST_MM = 0.1  # period of stripes of two dots, of a printer with 600 in an inch
 _ROUND_MM = 5.0
 _JIG_MM = 20.0
 
@@ -80,10 +81,13 @@ class Tile:
 def tiles_of(sheet: Sheet, paper: str) -> tuple[Tile, ...]:
     """Split a sheet into pages, portrait or landscape, whichever needs fewer; `paper` is "a4" or "letter".
 
-    Return the tiles row by row from below, each row from the left. ParameterError if it needs more than 400 pages, or
-    the paper is unknown.
+    Return the tiles row by row from below, each row from the left. ParameterError if it needs more than 400 pages, has
+    stripes finer than a printer's dots, or the paper is unknown.
     """
     require(paper in PAPERS_MM, "paper", paper, " or ".join(PAPERS_MM))
+    if isinstance(sheet.pattern, Stripes):
+        period_mm, allowed = sheet.pattern.period_mm, f"{_FINEST_MM} or more, which a printer can draw"
+        require(period_mm >= _FINEST_MM, f"period_mm of {sheet.name}", period_mm, allowed)
     ways = []
     for page in (PAPERS_MM[paper], PAPERS_MM[paper][::-1]):
         rooms_mm = page[0] - LEFT_MM - RIGHT_MM, page[1] - BOTTOM_MM - TOP_MM

@@ -196,38 +196,34 @@ def _even_odd_boundary_edges(edges: FloatArray) -> FloatArray:
     size = float(np.ptp(edges.reshape(-1, 2), axis=0).max())
     require(size != 0, "vertices_mm", edges[:, 0].tolist(), "a polygon whose area is not 0")
     pieces: dict[tuple[tuple[float, float], tuple[float, float]], None] = {}
+    other = edges[:, 1] - edges[:, 0]
     for start, end in edges:
         cuts = {0.0, 1.0}
         step = end - start
         length2 = float(step @ step)
         if length2 == 0:
             continue
-        for other_start, other_end in edges:
-            other = other_end - other_start
-            between = other_start - start
-            cross = step[0] * other[1] - step[1] * other[0]
-            if abs(cross) > 1e-12 * size * size:
-                t = (between[0] * other[1] - between[1] * other[0]) / cross
-                s = (between[0] * step[1] - between[1] * step[0]) / cross
-                if -1e-12 <= s <= 1 + 1e-12:
-                    cuts.add(float(t))
-            elif abs(step[0] * between[1] - step[1] * between[0]) <= 1e-9 * size * math.sqrt(length2):
-                cuts.update((float(between @ step) / length2, float((other_end - start) @ step) / length2))
+        cross = step[0] * other[:, 1] - step[1] * other[:, 0]
+        between, is_parallel = edges[:, 0] - start, np.abs(cross) <= 1e-12 * size * size
+        with np.errstate(all="ignore"):  # of parallel ones
+            t = (between[:, 0] * other[:, 1] - between[:, 1] * other[:, 0]) / cross
+            s = (between[:, 0] * step[1] - between[:, 1] * step[0]) / cross
+        cuts.update(t[~is_parallel & (s >= -1e-12) & (s <= 1 + 1e-12)].tolist())
+        is_near = np.abs(step[0] * between[:, 1] - step[1] * between[:, 0]) <= 1e-9 * size * math.sqrt(length2)
+        for k in np.flatnonzero(is_parallel & is_near):  # on one line
+            cuts.update((float(between[k] @ step) / length2, float((edges[k, 1] - start) @ step) / length2))
         ordered = sorted(t for t in cuts if 0 <= t <= 1)
         for a, b in pairwise(ordered):
             if b - a > 1e-9:
                 p, q = (tuple(np.round(start + t * step, 9).tolist()) for t in (a, b))
                 pieces.setdefault((min(p, q), max(p, q)))
-    kept = []
-    for p, q in pieces:
-        ends = np.array([p, q])
-        middle, along = ends.mean(axis=0), ends[1] - ends[0]
-        left = np.array([-along[1], along[0]]) / np.hypot(*along) * 1e-7 * size
-        sides = _count_ray_crossings(edges[None], np.stack([middle + left, middle - left]))[0] % 2
-        if sides[0] != sides[1]:
-            kept.append(ends if sides[0] else ends[::-1])
-    require(kept, "vertices_mm", edges[:, 0].tolist(), "a polygon whose area is not 0")
-    return np.stack(kept)
+    ends = np.array([*pieces]).reshape(-1, 2, 2)
+    middle, along = ends.mean(axis=1), ends[:, 1] - ends[:, 0]
+    left = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.hypot(*along.T)[:, None] * 1e-7 * size
+    is_in = _count_ray_crossings(edges[None], np.concatenate([middle + left, middle - left])).reshape(2, -1) % 2 == 1
+    kept = np.where(is_in[0, :, None, None], ends, ends[:, ::-1])[is_in[0] != is_in[1]]
+    require(len(kept), "vertices_mm", edges[:, 0].tolist(), "a polygon whose area is not 0")
+    return kept
 
 
 @outlines.register

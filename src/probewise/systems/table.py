@@ -31,7 +31,7 @@ from probewise._kinds import checked_path, require_kind
 from probewise.errors import FileError, ParameterError, ShapeError, require
 from probewise.recordings import Instrumentation, Recording
 from probewise.recordings.cells import first_cell_without_number, parsed_numbers, times_to_numbers
-from probewise.recordings.columns import text_of_name
+from probewise.recordings.columns import notes_on_numbers_as_names, text_of_name
 from probewise.recordings.plan import masks_of_readings_at_ends
 from probewise.recordings.table import csv_text, number_text, read_table
 
@@ -92,8 +92,7 @@ class RunTable:
                 values, note = times_to_numbers(name, values, self.time_unit)
                 notes += [note] if note else []
             columns[name] = _checked_column(name, values, are_names=name == self.run)
-            if name == self.run and any(isinstance(v, float) and v % 1 > 0 for v in np.asarray(given).tolist()):
-                notes += [f"column {name} names runs by numbers, of which 1.10 is 1.1; read it as text if they are two"]
+            notes += notes_on_numbers_as_names(name, given, "runs") if name == self.run else []
             if name == self.run and 0 < np.count_nonzero(columns[name] == "") < len(columns[name]):
                 cure = "where an empty cell repeats the one above, fill it in"
                 notes += [f"the rows without a name in column {name} are taken for one run; {cure}"]

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from probewise._signals import defer_signals, raise_if_stopped, reporting_what_is_kept
-from probewise.errors import FileError, ParameterError, ProbewiseError, message_of, require
+from probewise.errors import FileError, NotDrawnError, ParameterError, message_of, require
 from probewise.progress import Progress, silent
 
 PAGE = "report.html"
@@ -383,10 +383,6 @@ class Output(NamedTuple):
     drawers: Mapping[str, Callable[[], bytes]]
     page: Callable[[Mapping[str, bytes]], str]
     main: str = ""
-
-
-class NotDrawnError(ProbewiseError):
-    """Report figures or pages that could not be drawn, beside results that are complete."""
 
 
 class Drawings:

@@ -136,6 +136,10 @@ class NotConvergedError(ProbewiseError, RuntimeError):
         super().__init__(message)
 
 
+class NotDrawnError(ProbewiseError):
+    """Report figures or pages that could not be drawn, beside results that are complete."""
+
+
 class DoubtfulResultWarning(UserWarning):
     """Warn of a usable but doubtful result; the result holds the reason too."""
 

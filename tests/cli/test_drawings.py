@@ -10,9 +10,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 
 from probewise._signals import Stopped
-from probewise._writing import Drawings, NotDrawnError, Output
+from probewise._writing import Drawings, Output
 from probewise.cli import main
-from probewise.errors import FileError
+from probewise.errors import FileError, NotDrawnError
 from probewise.proof import concealed_study
 from probewise.report.html import figure
 from probewise.systems import run_table_csv

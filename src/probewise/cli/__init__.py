@@ -21,10 +21,9 @@ import warnings
 from collections.abc import Sequence
 
 from probewise._signals import Stopped, stoppable
-from probewise._writing import NotDrawnError
 from probewise.cli._common import CLOSED, OutputError, error_in_one_line, print_complaint, print_warning
 from probewise.cli._options import VERBS, parser
-from probewise.errors import LinkError, NotConvergedError, ProbewiseError
+from probewise.errors import LinkError, NotConvergedError, NotDrawnError, ProbewiseError
 
 __all__ = ["VERBS", "main", "parser"]
 

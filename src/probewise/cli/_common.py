@@ -5,18 +5,16 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
-import shlex
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
 from probewise._words import count_with_noun
-from probewise._writing import Drawings
 from probewise.errors import ProbewiseError, printable, shown
 
 if TYPE_CHECKING:
+    from probewise._writing import Drawings
     from probewise.progress import Progress
 
 CLOSED = (ValueError, AttributeError)  # of sys.stdout and sys.stderr that a FILE.py has closed, or set to None
@@ -98,6 +96,9 @@ def message_to_resume(
     if not path.exists():
         return "nothing was written"
     words = [*arguments.words, *(option for option in options if option not in arguments.words)]
+    import shlex  # here, as help needs none
+    import subprocess
+
     command = (subprocess.list2cmdline if os.name == "nt" else shlex.join)(["probewise", *words])
     n = count()
     kept = f"{n} of {of} {noun}s" if of > 1 else count_with_noun(n, noun)

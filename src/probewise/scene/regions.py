@@ -223,7 +223,7 @@ def _even_odd_boundary_edges(edges: FloatArray) -> FloatArray:
     is_in = _count_ray_crossings(edges[None], np.concatenate([middle + left, middle - left])).reshape(2, -1) % 2 == 1
     kept = np.where(is_in[0, :, None, None], ends, ends[:, ::-1])[is_in[0] != is_in[1]]
     require(len(kept), "vertices_mm", edges[:, 0].tolist(), "a polygon whose area is not 0")
-    return kept
+    return np.asarray(kept)
 
 
 @outlines.register

@@ -527,18 +527,18 @@ def _emulate_nxt(to: argparse.ArgumentParser) -> None:
 
 
 VERBS: Mapping[str, tuple[str, Callable[[argparse.ArgumentParser], None]]] = {
-    "demo": ("Run everything: calibrate, find a hidden circle with two models, diagnose.", _demo),
-    "calibrate": ("Fit the sensor model of a recording; choose the number of Gaussians.", _calibrate),
-    "predict": ("Predict the readings of a plan: mean, sd and log density of each row.", _predict),
-    "explore": ("Let the robot find a shape, choosing each measurement itself.", _explore),
-    "study": ("Measure how many readings the robot needs, over many circles.", _study),
-    "audit": ("List, before any data, the effects that a plan cannot detect or tell apart.", _audit),
+    "demo": ("Show sensor and robot: calibrate, find a hidden circle with two models, diagnose.", _demo),
     "diagnose": ("Find which physics a sensor model, or a simulator of your own, leaves out of recordings.", _diagnose),
+    "fit": ("Fit a simulator of your own to a table: posterior, evidence, residuals; no diagnosis.", _fit),
+    "predict": ("Predict the readings of a plan: mean, sd and log density of each row.", _predict),
+    "audit": ("List, before any data, the effects that a plan cannot detect or tell apart.", _audit),
+    "calibrate": ("Fit the sensor model of a recording; choose the number of Gaussians.", _calibrate),
+    "explore": ("Let the robot find a shape, choosing each measurement itself.", _explore),
     "investigate": (
         "Record, diagnose, take the readings that the diagnosis advises, until it is settled.",
         _investigate,
     ),
-    "fit": ("Fit a simulator of your own to a table: posterior, evidence, residuals; no diagnosis.", _fit),
+    "study": ("Measure how many readings the robot needs, over many circles.", _study),
     "challenge": ("Measure how good a diagnosis is, on recordings with concealed effects.", _challenge),
     "sheets": ("Draw the patterns for a bench at true scale, to print.", _sheets),
     "arm": ("Check, move and read the LEGO arm; record a plan with it or another arm.", _arm),

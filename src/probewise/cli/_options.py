@@ -353,8 +353,8 @@ def _audit(to: argparse.ArgumentParser) -> None:
 
 def _diagnose(to: argparse.ArgumentParser) -> None:
     about = (
-        "recording, its JSON beside it; or paper or concealed, which ship; or an explore run's journal.jsonl; with "
-        "--simulator any table; several are diagnosed together"
+        "with --simulator any table; else a recording by a light sensor, its JSON beside it, or paper or concealed, "
+        "which ship, or an explore run's journal.jsonl; several are diagnosed together"
     )
     add(to, "recordings REC.csv", about, type=_recording, nargs="+")
     about = "an earlier calibration, whose posterior becomes the prior (default with a journal: the one of its run)"

@@ -449,7 +449,7 @@ def repaired_sensor(sensor: FittedSensor, last: Step, *, rng: np.random.Generato
     note = f"a run that explored with it found {spoken_name(name)} (probability {p:.3g})"
     if name in sensor.absent and effect is not None and name not in _OF_THE_RUN:
         sensor = sensor.with_leading_effects()  # the run's own model, which did not hold it
-    if effect is not None and name in {form.name for form in LEVELS_CHANGED}:
+    if effect is not None and name in {form.name for form in LEVELS_CHANGED}:  # the levels themselves have changed
         drawn, names = samples.samples(len(sensor.samples), rng=rng), effect.prior.names
         change = dict(zip(names, drawn[:, -len(names) :].T, strict=True))
         own = sensor.samples.copy()

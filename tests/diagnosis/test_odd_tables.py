@@ -164,6 +164,18 @@ def test_a_column_that_is_the_reading_in_another_unit_explains_nothing(same, opt
     assert ("curve:same" in prepared.effects) != is_same
 
 
+def test_a_table_that_was_pasted_twice_gets_a_note():
+    """Its readings would count as twice as many."""
+
+    def notes(rows):
+        table = table_for(_line(), {"x": _X[rows], "y": _Y[rows]})
+        return prepare_system(_line(), table).recording.notes
+
+    (note,) = notes(np.tile(np.arange(_N), 2))
+    assert note.startswith("each row is there 2 times")
+    assert not notes(np.r_[:_N, :9])
+
+
 def test_a_table_of_readings_alone_is_refused():
     constant = Simulator("y", "V", {"a": (-5, 5)}, simulate=lambda p, u: p["a"])
     with pytest.raises(ParameterError, match=r"columns is \['y'\]; allowed: a column besides the reading"):

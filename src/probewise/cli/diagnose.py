@@ -33,7 +33,7 @@ from probewise.cli._inputs import (
     tables_and_descriptions,
 )
 from probewise.cli._options import parser, refuse_options
-from probewise.errors import ParameterError, PipeWarning, ProbewiseError, require
+from probewise.errors import FileError, ParameterError, PipeWarning, ProbewiseError, require
 from probewise.progress import Progress
 from probewise.recordings import Recording, read_recording
 from probewise.recordings.table import csv_text
@@ -126,8 +126,11 @@ def _diagnose_each(arguments: argparse.Namespace) -> int:
     from probewise.report import each as report
 
     files = dict(zip(_device_names(arguments.recordings), arguments.recordings, strict=True))
-    out = checked_output_directory(arguments.out, *files, main="counts.svg")
+    out = checked_output_directory(arguments.out, main="counts.svg")
     for name in files:
+        if (out / name).is_symlink():
+            allowed = "another folder, or an ordinary one there"
+            raise FileError(out / name, "is a symbolic link, which may lead out of the folder", allowed)
         checked_output_directory(out / name, main="diagnosis.json")
     fingerprints = {name: _fingerprint(arguments, file) for name, file in files.items()}
 

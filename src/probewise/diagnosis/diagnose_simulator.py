@@ -9,6 +9,7 @@ the readings as well; there it is the step that likely parameters need.
 from __future__ import annotations
 
 import contextlib
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, cast
@@ -327,6 +328,15 @@ def _note_on_gaps_without_runs(simulator: Simulator, table: RunTable) -> tuple[s
     return (f"{said}; if separate runs begin at such jumps, a column that names them, and run = its name, say so",)
 
 
+def _note_on_copied_rows(table: RunTable) -> tuple[str, ...]:
+    """Return a note if each row of a table is there several times, as where it was pasted twice; else ()."""
+    times = {*Counter(zip(*(values.tolist() for values in table.columns.values()), strict=True)).values()}
+    if len(times) > 1 or times == {1}:
+        return ()
+    said = f"each row is there {times.pop()} times, and counts as often: if it was taken once, every sd is too small"
+    return (f"{said}; delete the copies",)
+
+
 def _without_copies_of_reading(simulator: Simulator, table: RunTable) -> RunTable:
     """Leave out, with a note, columns that are the reading in another unit, unless the simulator reads them."""
     readings, inputs = table.covariates.get(simulator.reading), simulator.inputs(table.covariates)
@@ -535,7 +545,8 @@ def prepare_system(
     A law is integrated by a linearly implicit method if `stiff`, or where it needs one.
     """
     table = _without_copies_of_reading(simulator, table) if with_effects else table
-    said = (*table.notes, *notes, *note_on_row_order(simulator, table), *_note_on_gaps_without_runs(simulator, table))
+    order = (*_note_on_copied_rows(table), *note_on_row_order(simulator, table))
+    said = (*table.notes, *notes, *order, *_note_on_gaps_without_runs(simulator, table))
     recording = replace(recording_from_table(simulator, table), source=source or simulator.source, notes=said)
     system = System.of(simulator, table, stiff=stiff)
     if with_effects and len(table) < 2:  # nothing can change along it

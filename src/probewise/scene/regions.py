@@ -221,7 +221,7 @@ def _even_odd_boundary_edges(edges: FloatArray) -> FloatArray:
     middle, along = ends.mean(axis=1), ends[:, 1] - ends[:, 0]
     left = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.hypot(*along.T)[:, None] * 1e-7 * size
     is_in = _count_ray_crossings(edges[None], np.concatenate([middle + left, middle - left])).reshape(2, -1) % 2 == 1
-    kept = np.where(is_in[0, :, None, None], ends, ends[:, ::-1])[is_in[0] != is_in[1]]
+    kept: FloatArray = np.where(is_in[0, :, None, None], ends, ends[:, ::-1])[is_in[0] != is_in[1]]
     require(len(kept), "vertices_mm", edges[:, 0].tolist(), "a polygon whose area is not 0")
     return np.asarray(kept)
 

@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from probewise._kinds import require_progress
 from probewise.errors import printable
+from probewise.nested import RoundSummary
 from probewise.progress import Progress, silent
 
 _PATIENCE_S = 2.0  # shorter work shows no bar
@@ -65,6 +66,16 @@ def progress_or_bar(progress: bool | Progress) -> Iterator[Progress]:
     else:
         require_progress(progress, "True, False, or a function")
         yield progress
+
+
+def sampler_progress(progress: Progress) -> Callable[[int | str, RoundSummary], None]:
+    """Return a function (name of the run or number of Gaussians, summary) that reports the state of nested sampling."""
+
+    def tell(what: int | str, state: RoundSummary) -> None:
+        stage = what if isinstance(what, str) else f"{what} Gaussian{'s' if what > 1 else ''}"
+        progress(stage, note=state.in_words)
+
+    return tell
 
 
 class _StageBars:

@@ -118,7 +118,7 @@ def calibrate(
     from probewise._progress import progress_or_bar
     from probewise.errors import ParameterError
     from probewise.nested import NESTED_STOP
-    from probewise.nested.sampler import sampler_progress
+    from probewise.nested.result import sampler_progress
 
     require_one_of("method", method, ("quick", "full", "paper"))
     paper = method == "paper"

@@ -94,7 +94,7 @@ _LATER = [datetime.timedelta(seconds=s) for s in (0, 2, 90)]
 def test_dates_clocks_and_time_differences_count_from_the_first_row(times):
     table = RunTable({"t": times, "y": np.zeros(3)}, "t")
     assert table.time_s.tolist() == [0.0, 2.0, 90.0]
-    assert table.notes[0].startswith("t counted in s from ")
+    assert table.notes[0].startswith("column 't' counted in s from ")
     np.testing.assert_allclose(RunTable({"t": times}, "t", time_unit="min").time_s, [0, 2 / 60, 1.5])
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from typing import Any, cast
 
 import numpy as np
@@ -32,7 +31,6 @@ from probewise.diagnosis.simulator_rows import SimulatorApparatus
 from probewise.errors import DoubtfulResultWarning, NotConvergedError, ParameterError, require
 from probewise.nested import Weighted
 from probewise.nested.importance import repartitioned
-from probewise.nested.sampler import sampler_progress
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Recording
 from probewise.systems import FittedSystem, RunTable, Simulator, System, table_for
@@ -279,7 +277,9 @@ def _nested(problem: HypothesisProblem, z: FloatArray, *, rng: np.random.Generat
     if problem.model.sensor.predicts_dearly:
         method, target = "nested sampling near the posterior", repartitioned(problem, z)
 
-    report_round = partial(sampler_progress(progress), "nested sampling")
+    def report_round(state: nested.RoundSummary) -> None:
+        progress("nested sampling", note=state.in_words)
+
     n_live = max(_N_LIVE, nested.LIVE_PER_PARAM * z.shape[1])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DoubtfulResultWarning)  # the doubt is part of the result

@@ -52,7 +52,6 @@ from probewise.nested.problem import AnyPrior, Bound, Evaluator, OutOfCallsError
 from probewise.nested.result import NestedResult, as_json, software_versions
 from probewise.nested.save import CheckpointFile, LivePoints, RunState, settings_of_run
 from probewise.nested.weights import n_effective
-from probewise.progress import Progress
 
 LIVE_PER_PARAM = 2
 """Least number of live points per parameter."""
@@ -65,6 +64,9 @@ _STUCK_SHARE = 0.02
 # possible was still 0.7 too low.
 _MIXING = 10
 _MOST_BYTES = 2**28  # of one array of each kind for all live points; the points that die take tens of times as much
+
+
+_MOST_TO_COME = 100.0  # nats, for a number that is finite
 
 
 @dataclass(frozen=True)
@@ -80,6 +82,12 @@ class RoundSummary:
     log_volume: float  # log of the remaining share of the prior
     best_log_likelihood: float
     on_plateau: bool = False  # whether all live points have the same likelihood
+
+    @property
+    def in_words(self) -> str:
+        """The state for a progress bar."""
+        to_come = math.exp(min(self.log_ratio_remaining, _MOST_TO_COME))
+        return f"{self.n_dead} points, ln Z {self.log_z:.1f}, at most {to_come:.1g} times Z to come"
 
 
 StopRule: TypeAlias = Callable[[RoundSummary], "str | None"]
@@ -519,14 +527,3 @@ def _final_result(
         versions=software_versions(),
         warnings=tuple(note for note in doubts if note is not None),
     )
-
-
-def sampler_progress(progress: Progress) -> Callable[[int | str, RoundSummary], None]:
-    """Return a function (name of the run or number of Gaussians, summary) that reports the state of nested sampling."""
-
-    def tell(what: int | str, state: RoundSummary) -> None:
-        stage = what if isinstance(what, str) else f"{what} Gaussian{'s' if what > 1 else ''}"
-        to_come = math.exp(min(state.log_ratio_remaining, 100.0))
-        progress(stage, note=f"{state.n_dead} points, ln Z {state.log_z:.1f}, at most {to_come:.1g} times Z to come")
-
-    return tell

@@ -115,10 +115,9 @@ def calibrate(
     """
     from probewise import calibration
     from probewise._kinds import require_one_of
-    from probewise._progress import progress_or_bar
+    from probewise._progress import progress_or_bar, sampler_progress
     from probewise.errors import ParameterError
     from probewise.nested import NESTED_STOP
-    from probewise.nested.result import sampler_progress
 
     require_one_of("method", method, ("quick", "full", "paper"))
     paper = method == "paper"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from typing import cast
 
 import numpy as np
 
@@ -66,14 +67,9 @@ def backlash(kind: LightEffect, of: Extent) -> Effect:
 
 @light_effect("backlash", Stage.POSE, "backlash (play) of each axis", ("slope", "direction"))
 def play_of_axes(kind: LightEffect, of: Extent) -> Effect:
-    """Play in the gears of each axis: X - (x_mm / 2) s, s the side that X last moved to, and Y by its own play."""
-
-    def act(value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        return _moved(value, *(-(theta[:, k : k + 1] / 2) * side for k, side in enumerate(_side_of_each_axis(plan))))
-
-    says = "each axis comes to rest short of where it was sent: gear play of {0} mm along X and {1} mm along Y"
-    units, words = {"x_mm": "mm", "y_mm": "mm"}, in_words(says)
-    return kind.linear(of, units, 0.005 * of.length_mm, act, words, positive=True, form="of each axis")
+    """Play in the gears of each axis: position = commanded - (width_mm / 2) s, s the side it last moved to."""
+    act = acting(lambda value, plan, width: _moved(value, *(-(width / 2) * side for side in _side_of_each_axis(plan))))
+    return replace(cast(Effect, backlash.build(kind, of)), apply=act, form="of each axis")
 
 
 def _side_of_each_axis(plan: Plan) -> FloatArray:

@@ -382,7 +382,8 @@ class LeftOutEffects:
     def as_json(self) -> dict[str, Any]:
         """Return the entry "left_out" of result.json."""
         hypotheses = [
-            {"effects": [] if name == CLEAN else name.split("+"), "probability": p} for name, p in self.probability.items()
+            {"effects": [] if name == CLEAN else name.split("+"), "probability": p}
+            for name, p in self.probability.items()
         ]
         return {"hypotheses": hypotheses, "credible_set": list(self.credible_set), "sentence": self.sentence}
 

@@ -25,6 +25,7 @@ from probewise.proof.tables import (
     is_recognised_as_out_of_vocabulary,
     names_effect_on_mean,
     score,
+    score_systems,
 )
 from probewise.recordings import write_text_atomically
 from probewise.recordings.table import csv_text_of_rows
@@ -71,7 +72,8 @@ def main() -> None:
     parser.add_argument("later", type=Path)
     parser.add_argument("--out", type=Path, required=True)
     arguments = parser.parse_args()
-    both = read_campaign(arguments.earlier).results, read_campaign(arguments.later).results
+    read = read_campaign(arguments.earlier), read_campaign(arguments.later)
+    both, table = [each.results for each in read], score_systems if read[1].settings.get("of") == "systems" else score
     keys = [key for key in both[1] if key in both[0] and not any("failed" in results[key] for results in both)]
     earlier, later = ([results[key] for key in keys] for results in both)
     n_verdicts = sum(a["verdict"] == b["verdict"] for a, b in zip(earlier, later, strict=True))
@@ -86,7 +88,7 @@ def main() -> None:
             **{f"earlier {part}": round(getattr(old.found, part), 4) for part in ("value", "low", "high")},
             **{f"later {part}": round(getattr(new.found, part), 4) for part in ("value", "low", "high")},
         }
-        for old, new in zip(score(earlier), score(later), strict=True)
+        for old, new in zip(table(earlier), table(later), strict=True)
     ]
     write_text_atomically(arguments.out, csv_text_of_rows(rows[0], (row.values() for row in rows)))
 

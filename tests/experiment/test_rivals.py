@@ -121,7 +121,7 @@ def test_every_rival_reaches_another_process():
 
 def test_a_rival_is_of_a_size_and_at_a_time_that_a_run_can_show():
     found = {rival.name: rival.effect.prior.marginals for rival in rivals() if rival.effect is not None}
-    width, at_s = found["backlash"]["x_mm"], found["ambient_step"]["at_s"]
+    width, at_s = found["backlash"]["width_mm"], found["ambient_step"]["at_s"]
     assert width.to_unit(np.array([0.5]))[0] < 0.3
     run_of_twelve = at_s.to_unit(np.array([4.0, 12 * 8.0]))
     assert run_of_twelve[0] == 0.0

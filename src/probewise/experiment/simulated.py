@@ -177,10 +177,8 @@ class HiddenShape:
         low, high = (np.diagonal(prior.from_unit_cube(np.where(one, end, given))) for end in (0.0, 1.0))
         for k, value in enumerate(values.tolist()):
             if not low[k] <= value <= high[k]:
-                option = called.partition(" ")[0]
-                allowed = (
-                    f"{low[k]:g} to {high[k]:g}, as the {name}'s prior has it; without {option} the seed draws one"
-                )
+                allowed = f"{low[k]:g} to {high[k]:g}, as the {name}'s prior has it"
+                allowed += "; without it the seed draws one" * ("truth" in called)
                 raise ParameterError(f"{prior.names[k]} of {called}", value, allowed)
         return cls(name, shape, values)
 

@@ -43,7 +43,7 @@ def swing(start_deg: float) -> np.ndarray:
 rng = np.random.default_rng(seed)
 releases = [60.0, -35.0, 50.0]
 swings = {
-    "release": np.repeat(["first", "second", "third"], len(TIME_S)),
+    "release": np.repeat(["A", "B", "C"], len(TIME_S)),
     "t_s": np.tile(TIME_S, len(releases)),
     "room_c": np.repeat([21.3, 21.6, 21.9], len(TIME_S)),
     "angle_deg": np.concatenate([swing(start) for start in releases]) + 0.1 * rng.standard_normal(3 * len(TIME_S)),

@@ -320,7 +320,7 @@ def _note_on_gaps_without_runs(simulator: Simulator, table: RunTable) -> tuple[s
     if simulator.law is None or table.run is not None or not table.has_varying_time:
         return ()
     gaps = np.diff(table.time_s)
-    long = np.flatnonzero(gaps > _LONG_GAP * np.median(gaps))
+    long = np.flatnonzero(gaps > _LONG_GAP * np.median(gaps[gaps > 0]))
     if gaps[long].sum() <= 0.5 * gaps.sum():
         return ()
     at = table.first_line + int(long[0])

@@ -200,7 +200,7 @@ def commands(cell: Cell, folder: Path) -> tuple[list[list[str]], float | None]:
         case = conceal_form(where, what, rng)
         file, table, test = map(str, write_system_case(case, folder))
         following = ["fit", table] if verb == "audit" else ["predict", "repaired.json", test]
-        sizes = [effect.size_lambda for effect in (*case.effects, case.noise)]
+        sizes = [*(effect.size_lambda for effect in case.effects), None]
         return [[words[0], *words[1:], "--simulator", file] for words in ([verb, table], following)], sizes[0]
     plan = with_jittered_times(plan_named(where), rng=rng)
     world, size = conceal_effect(what, plan, rng)

@@ -395,7 +395,7 @@ def _alias_elements(diagnosis: Diagnosis) -> Sequence[str]:
     said = "While they are small, the effects of a pair change these readings alike; larger ones may differ, as the "
     said += "probabilities above say."
     if diagnosis.is_settled:
-        said = f"None of these pairs leaves this diagnosis open. {said}"
+        said = f"This diagnosis is settled: no pair of these leaves it open. {said}"
         return (said, html.details(f"{count_with_noun(len(ranked), 'pair')}", _alias_table(ranked)))
     folded = (html.details(f"{len(rest)} more pairs", _alias_table(rest)),) if rest else ()
     return (said, _alias_table(first), *folded)

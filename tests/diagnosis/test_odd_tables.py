@@ -103,7 +103,7 @@ def test_a_simulator_that_copes_with_a_missing_input_has_effects_of_that_column(
 
 @pytest.mark.parametrize(("gap", "n_variants"), [(100.0, 2), (0.0, 1)])
 def test_a_drift_of_runs_that_follow_each_other_may_begin_again_in_each(gap, n_variants):
-    """Three days of a tank's level were once named a wave of one day, since no drift counted from each morning."""
+    """Without it, three days of a tank's level whose meter drifts from each morning on look like a wave of one day."""
     run = np.repeat([1.0, 2.0], _N // 2)
     time = np.tile(_T[: _N // 2], 2) + gap * (run - 1.0)
     simulator = Simulator("y", "V", {"a": (-5, 5)}, simulate=lambda p, u: p["a"] + 0.0 * u["t"], time="t", run="run")
@@ -118,7 +118,7 @@ def test_a_drift_of_runs_that_follow_each_other_may_begin_again_in_each(gap, n_v
 
 @pytest.mark.parametrize(("gap", "n_notes"), [(0.0, 0), (500.0, 1)])
 def test_a_time_that_jumps_where_no_run_is_named_is_noted(gap, n_notes):
-    """Of a law, which goes on through the gap; readings after it were called lost."""
+    """Of a law, which goes on through the gap, so that readings after it look lost."""
     law = Simulator("y", "V", {"a": (-3, 3)}, law=Law({"s": "a"}, lambda s, p, u: {"s": -0.1 * s["s"]}), time="t")
     table = table_for(law, {"t": _T + gap * (_T >= 10.0), "y": np.exp(-0.1 * _T) + 0.01 * np.cos(7 * _T)})
     notes = prepare_system(law, table).recording.notes

@@ -258,7 +258,7 @@ def test_results_of_an_earlier_run_do_not_stand_beside_a_new_journal_when_it_is_
 def test_a_full_disk_names_the_picture_and_the_journal(sensor_file, tmp_path, quick_frames, monkeypatch, capsys):
     import resource
 
-    monkeypatch.setattr("probewise.cli.explore.animated_gif", lambda _: bytes(5_000_000))
+    monkeypatch.setattr("probewise.report.exploration.animated_gif", lambda _: bytes(5_000_000))
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4_000_000, limits[1]))
     out = tmp_path / "out"

@@ -81,7 +81,7 @@ print(diagnosis.summary())
 
 # %%
 fig, axes = plt.subplots(2, 1, figsize=(8, 5), sharex=True)
-first = swings["release"] == "first"
+first = swings["release"] == "A"
 axes[0].plot(TIME_S, swings["angle_deg"][first], "k.", markersize=3, label="recorded")
 axes[0].plot(TIME_S, diagnosis.after.readings[first], color="tab:blue", label="repaired")
 axes[0].set_ylabel("angle (deg)")

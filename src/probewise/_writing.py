@@ -166,7 +166,7 @@ def checked_output_directory(path: Path, *entries: str, main: str = "", option: 
         what = "is no directory" if nearest.is_symlink() else "is a file"
         here = "this" if nearest == path else nearest
         raise ParameterError(option, str(path), f"a directory, existing or new; {here} {what}")
-    _require_ordinary(p for entry in entries for p in (path / entry, *path.glob(f"{entry}/*")))
+    require_ordinary(p for entry in entries for p in (path / entry, *path.glob(f"{entry}/*")))
     import tempfile  # here, as help needs none
 
     try:  # permissions are not enough: /proc and read-only mounts cannot be written to
@@ -319,7 +319,7 @@ def _require_place(out: Path, name: str) -> None:
     """Raise FileError if a directory has the name of a result, or anything else that of its directory."""
     path = out / name
     folders = path.parents[: name.count("/")]
-    _require_ordinary(folders)
+    require_ordinary(folders)
     if path.is_dir() and not path.is_symlink():
         raise FileError(path, "a directory of that name is in the way", "another folder, or none there")
     for folder in filter(Path.is_file, folders):
@@ -355,7 +355,7 @@ def _files_in(folder: Path) -> list[str]:
     return sorted(file.relative_to(folder).as_posix() for file in files)
 
 
-def _require_ordinary(paths: Iterable[Path]) -> None:
+def require_ordinary(paths: Iterable[Path]) -> None:
     """Raise FileError if one of these is neither a file nor a directory, nor missing."""
     for path in paths:
         if path.is_symlink() or is_device_or_pipe(path):

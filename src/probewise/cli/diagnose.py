@@ -20,7 +20,7 @@ from probewise import diagnosis as engine
 from probewise._signals import reporting_what_is_kept
 from probewise._tasks import results_as_tasks_end
 from probewise._version import __version__
-from probewise._writing import PAGE, Drawings, Output, checked_output_directory
+from probewise._writing import PAGE, Drawings, Output, checked_output_directory, require_ordinary
 from probewise.calibration import read_sensor
 from probewise.cli._common import CommandError, error_in_one_line, finish, message_to_resume, progress_of
 from probewise.cli._executor import open_executor
@@ -33,7 +33,7 @@ from probewise.cli._inputs import (
     tables_and_descriptions,
 )
 from probewise.cli._options import parser, refuse_options
-from probewise.errors import FileError, ParameterError, PipeWarning, ProbewiseError, require
+from probewise.errors import ParameterError, PipeWarning, ProbewiseError, require
 from probewise.progress import Progress
 from probewise.recordings import Recording, read_recording
 from probewise.recordings.table import csv_text
@@ -128,9 +128,7 @@ def _diagnose_each(arguments: argparse.Namespace) -> int:
     files = dict(zip(_device_names(arguments.recordings), arguments.recordings, strict=True))
     out = checked_output_directory(arguments.out, main="counts.svg")
     for name in files:
-        if (out / name).is_symlink():
-            allowed = "another folder, or an ordinary one there"
-            raise FileError(out / name, "is a symbolic link, which may lead out of the folder", allowed)
+        require_ordinary([out / name])
         checked_output_directory(out / name, main="diagnosis.json")
     fingerprints = {name: _fingerprint(arguments, file) for name, file in files.items()}
 

@@ -330,6 +330,9 @@ def _note_on_gaps_without_runs(simulator: Simulator, table: RunTable) -> tuple[s
 
 def _note_on_copied_rows(table: RunTable) -> tuple[str, ...]:
     """Return a note if each row of a table is there several times, as where it was pasted twice; else ()."""
+    like_first = np.all([values == values[0] for values in table.columns.values()], axis=0)
+    if like_first.sum() < 2:
+        return ()  # before all rows of a long table are counted
     times = {*Counter(zip(*(values.tolist() for values in table.columns.values()), strict=True)).values()}
     if len(times) > 1 or times == {1}:
         return ()

@@ -119,23 +119,22 @@ def test_a_rival_that_the_readings_cannot_tell_from_the_leader_keeps_it_from_bei
     assert verdict({(("lag",), ()): 0.9, (("backlash",), ()): 0.1}, same=[("backlash",)]) == ("named", ("lag",))
 
 
-def test_of_a_simulator_nothing_is_named_below_one_half():
-    """Whatever noise is beside it counts; a light sensor's contract names the leader of several."""
+def test_nothing_is_named_below_one_half():
+    """Whatever noise is beside it counts."""
     three = {(("lag",), ()): 0.4, (("drift",), ()): 0.3, (("glint",), ()): 0.3}
-    assert verdict(three) == ("named", ("lag",))
-    assert verdict(three, named_needs_half=True) == ("cannot_tell", ("lag",))
+    assert verdict(three) == ("cannot_tell", ("lag",))
     noisy = {(("lag",), ()): 0.4, (("lag",), ("outliers",)): 0.2, (("glint",), ()): 0.4}
-    assert verdict(noisy, named_needs_half=True) == ("named", ("lag",))
+    assert verdict(noisy) == ("named", ("lag",))
 
 
-def test_of_a_simulator_the_leader_is_the_effect_on_the_mean_with_the_most_probability_over_all_noises():
+def test_the_leader_is_the_effect_on_the_mean_with_the_most_probability_over_all_noises():
     """An alias of a hundredth does not tip the class over one half, either."""
     split = {(("lag",), ()): 0.33, (("lag",), ("outliers",)): 0.27, (("drift",), ()): 0.4}
-    assert verdict(split, named_needs_half=True) == ("named", ("lag",))
+    assert verdict(split) == ("named", ("lag",))
     pair = Alias(("drift", "lag"), 0.95, "repeat", 26)
     split = {(("lag",), ()): 0.49, (("lag",), ("outliers",)): 0.42, (("drift",), ()): 0.02, ((), ()): 0.07}
-    assert verdict(split, aliases=(pair,), same=[("drift",)], named_needs_half=True) == ("named", ("lag",))
-    assert verdict({((), ("outliers",)): 0.6, (("lag",), ()): 0.4}, named_needs_half=True) == ("noise", ("outliers",))
+    assert verdict(split, aliases=(pair,), same=[("drift",)]) == ("named", ("lag",))
+    assert verdict({((), ("outliers",)): 0.6, (("lag",), ()): 0.4}) == ("noise", ("outliers",))
 
 
 def by_what_is_shared(verdict, combination, probabilities, *, p_value=1e-6, aliases=()):

@@ -43,42 +43,50 @@ EffectEntry: TypeAlias = tuple[Effect, FloatArray]
 """An effect, and settings of its parameters, (n_columns, n_effect_params), that make one template."""
 
 
-class _Columns(NamedTuple):
-    """The columns of an effect, in noise sds: in `old` readings and `further` ones, (n_points, n_columns) each.
+class _Change(NamedTuple):
+    """A change by an effect in noise sds: its columns in `old` readings and `further` ones, (n_points, n_columns) each.
 
-    `of_run`: whether each is the value of one run; then `further` are the columns of the mean of all runs' values.
+    `of_run`: whether each column is the value of one run; then `further` are the columns of the mean of all runs'
+    values. `values`: how much of each column, (n_columns,).
     """
 
     old: FloatArray
     further: FloatArray
     of_run: bool
+    values: FloatArray
 
 
-Amounts = tuple[_Columns, FloatArray]
-"""A change by an effect: its columns, and how much of each, (n_columns,)."""
+def nats_against(
+    slopes: tuple[FloatArray, FloatArray], truth: _Change, rival: _Change
+) -> Callable[[IntArray, IntArray], FloatArray]:
+    """Return the expected log Bayes factor of an effect that acts over another, which is refitted, as a function.
 
+    It takes the rows of one further run, and how many of them are read, evenly spread, (n_counts,); it returns nats,
+    (n_counts,), NaN if an effect has no finite change. A rival with a value per run has one more there, known as far as
+    its values scatter.
 
-def nats_against(slopes: Sequence[FloatArray], truth: Amounts, rival: Amounts, rows: IntArray) -> FloatArray:
-    """Return the expected log Bayes factor of an effect that acts over another, which is refitted, (n_counts,).
-
-    `slopes`: of the old readings, and of those of one further run, by coordinates with a standard normal prior; `rows`:
-    those of the run, of which any number are taken, evenly spread. A rival with a value per run has one more there,
-    known as far as its values scatter. NaN if an effect has no finite change.
+    `slopes`: of the old readings, and of further ones, by coordinates with a standard normal prior.
     """
-    (true, values), (other, others), (p, k) = truth, rival, (slopes[0].shape[1], rival[0].old.shape[1])
-    own = other.further[rows, :1] * (k * others.std()) if other.of_run else np.zeros((len(rows), 0))
-    after = np.concatenate([slopes[1], other.further[rows], own, true.further[rows] @ values[:, None]], axis=1)
+    p, k = slopes[0].shape[1], rival.old.shape[1]
+    own = rival.further[:, : int(rival.of_run)] * (k * rival.values.std())
     absent = np.zeros((len(slopes[0]), own.shape[1]))
-    before = np.concatenate([slopes[0], other.old, absent, true.old @ values[:, None]], axis=1)
-    products = before.T @ before + COUNTS[:, None, None] * (after.T @ after / len(after))
-    if not np.isfinite(products).all():
-        return np.full(len(COUNTS), np.nan)
-    precision = np.concatenate([np.ones(p), np.full(k, _NEARLY_FLAT), np.ones(own.shape[1])])
-    fitted, along = products[:, :-1, :-1] + np.diag(precision), products[:, :-1, -1:]
-    scale = np.sqrt(np.einsum("mii->mi", fitted))[:, :, None]  # against rounding
-    among, along = fitted / (scale * scale.transpose(0, 2, 1)), along / scale
-    absorbed = along.transpose(0, 2, 1) @ np.linalg.solve(among, along)
-    return np.asarray(0.5 * (products[:, -1, -1] - absorbed[:, 0, 0]))
+    before = np.concatenate([slopes[0], rival.old, absent, truth.old @ truth.values[:, None]], axis=1)
+    further = np.concatenate([slopes[1], rival.further, own, truth.further @ truth.values[:, None]], axis=1)
+    known = before.T @ before
+    precision = np.diag(np.concatenate([np.ones(p), np.full(k, _NEARLY_FLAT), np.ones(own.shape[1])]))
+
+    def nats(rows: IntArray, counts: IntArray) -> FloatArray:
+        after = further[rows]
+        products = known + counts[:, None, None] * (after.T @ after / len(after))
+        if not np.isfinite(products).all():
+            return np.full(len(counts), np.nan)
+        fitted, along = products[:, :-1, :-1] + precision, products[:, :-1, -1:]
+        scale = np.sqrt(np.einsum("mii->mi", fitted))[:, :, None]  # against rounding
+        among, along = fitted / (scale * scale.transpose(0, 2, 1)), along / scale
+        absorbed = along.transpose(0, 2, 1) @ np.linalg.solve(among, along)
+        return np.asarray(0.5 * (products[:, -1, -1] - absorbed[:, 0, 0]))
+
+    return nats
 
 
 ALIAS_COSINE = 0.9
@@ -170,7 +178,7 @@ def pairs_with_separating_scans(
     further, known = np.concatenate([shared, own], axis=1), problem.whiten(found.slopes)
     before = np.concatenate([known, np.zeros((len(known), len(of_run)))], axis=1)
 
-    def columns_of(effect: Effect, settings: FloatArray) -> _Columns:
+    def change_by(effect: Effect, settings: FloatArray) -> _Change:
         with_effect = found.model.with_effect(effect)
         values = with_effect.z_of_last_effect(settings)
         points = np.concatenate([np.repeat(found.z[None, :], len(values), axis=0), values], axis=1)
@@ -182,38 +190,40 @@ def pairs_with_separating_scans(
         is_of_run = len(apparatus.coordinates_of_new_run(with_effect)) > len(of_run)
         if is_of_run:  # the new run's value is about the mean of the others
             new = np.repeat(new.mean(axis=1, keepdims=True), new.shape[1], axis=1)
-        return _Columns(old / length, new / length, is_of_run)
+        return _Change(old / length, new / length, is_of_run, np.zeros(len(values)))
 
-    columns = {name: columns_of(*entries[name]) for name in sorted({name for p in pairs for name in p.effects})}
-    sized = {pair.effects: _collinear_amounts(problem, *(columns[name] for name in pair.effects)) for pair in pairs}
-    best = {pair.effects: (MOST_ADVISED_READINGS + 1, -NOTHING_NATS, pair) for pair in pairs}  # the least is best
-    for scan, rows in zip(scans, rows_by_candidate(scans), strict=True):
-        slopes = before, further[rows]
-        for effects, (one, other) in sized.items():
-            gained = [nats_against(slopes, *acting, rows) for acting in ((one, other), (other, one))]
-            nats = np.min([nats - nats[0] for nats in gained], axis=0)
-            if not nats[-1] > NOTHING_NATS:
+    changes = {name: change_by(*entries[name]) for name in sorted({name for p in pairs for name in p.effects})}
+    each_scan, out = list(zip(scans, rows_by_candidate(scans), strict=True)), list[Alias]()
+    for pair in pairs:
+        one, other = _collinear(problem, *(changes[name] for name in pair.effects))
+        contests = [nats_against((before, further), *acting) for acting in ((one, other), (other, one))]
+        best, advised = (MOST_ADVISED_READINGS + 1, -NOTHING_NATS), pair  # the least is best
+        for scan, rows in each_scan:
+            # Few scans gain anything: the numbers of readings in between wait for those that do.
+            if not np.min([np.diff(nats(rows, COUNTS[[0, -1]])) for nats in contests]) > NOTHING_NATS:
                 continue
-            enough = np.flatnonzero(nats >= ENOUGH_NATS)
+            every = [nats(rows, COUNTS) for nats in contests]
+            gained = np.min([nats - nats[0] for nats in every], axis=0)
+            enough = np.flatnonzero(gained >= ENOUGH_NATS)
             needed = int(COUNTS[enough[0]]) if enough.size else MOST_ADVISED_READINGS + 1
-            most = float(nats[enough[0] if enough.size else -1])
-            if (needed, -most) < best[effects][:2]:
+            result = needed, -float(gained[enough[0] if enough.size else -1])
+            if result < best:
                 readings = min(needed, MOST_ADVISED_READINGS)
-                asked = replace(best[effects][2], settle_by=scan.description, readings=readings)
-                best[effects] = (needed, -most, asked)
-    return [alias for _, _, alias in best.values()]
+                best, advised = result, replace(pair, settle_by=scan.description, readings=readings)
+        out.append(advised)
+    return out
 
 
-def _collinear_amounts(problem: Linearised, *effects: _Columns) -> list[Amounts]:
-    """Return the most collinear changes by two effects, each of lambda 8."""
-    (first, of_first), (second, of_second) = (_projected_basis(problem, effect.old) for effect in effects)
+def _collinear(problem: Linearised, *changes: _Change) -> list[_Change]:
+    """Return the most collinear changes by two effects, each of lambda 8; nothing of both if the fit absorbs one."""
+    (first, of_first), (second, of_second) = (_projected_basis(problem, change.old) for change in changes)
     if not (first.size and second.size):
-        return [(effect, np.zeros(effect.old.shape[1])) for effect in effects]
+        return list(changes)
     left, _, right = np.linalg.svd(first.T @ second)
     out = []
-    for effect, values in zip(effects, (of_first @ left[:, 0], of_second @ right[0]), strict=True):
-        seen = max(1.0, LEAST_SHARE * float(np.linalg.norm(effect.old @ values)))
-        out.append((effect, values * (LAMBDA / seen)))
+    for change, values in zip(changes, (of_first @ left[:, 0], of_second @ right[0]), strict=True):
+        seen = max(1.0, LEAST_SHARE * float(np.linalg.norm(change.old @ values)))
+        out.append(change._replace(values=values * (LAMBDA / seen)))
     return out
 
 

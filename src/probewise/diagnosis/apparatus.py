@@ -67,8 +67,6 @@ class PriorOdds:
     Noise: `white`, and the rest divided among noise models by size, then equally.
     `complexity_penalty` (nats) is the penalty of an effect per Gaussian of the SSF that it makes superfluous, since
     physics rarely imitates an SSF's shape; `unknown_complexity_penalty` is that of an unknown effect.
-    `named_needs_half`: effects on the mean are `named` only with half the probability, whatever noise is beside, or
-    if nearly all hypotheses share them, whatever is open beside them. Otherwise the leading combination is named.
     `unlikely` are effects in places where hardly anything can be missing: each has `unlikely_weight` times the prior
     probability of another one.
     `twofold` are the effects that may occur twice; `twice` is the probability that one does, given that it occurs;
@@ -87,7 +85,6 @@ class PriorOdds:
     noise_by_size: tuple[float, ...] = (0.057, 0.0028, 0.0002)
     complexity_penalty: float = 8.0
     unknown_complexity_penalty: float = 24.0
-    named_needs_half: bool = False
     twice: float | None = None
     twofold: frozenset[str] = frozenset()
     unlikely: frozenset[str] = frozenset()

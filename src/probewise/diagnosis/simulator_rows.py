@@ -259,7 +259,6 @@ class SimulatorApparatus(Apparatus):
         return replace(
             PriorOdds.for_effects(effects),
             twice=TWICE,
-            named_needs_half=True,
             unlikely=names_in_definitions(self.about, effects) | names_of_jumps_in_sorted_rows(effects) | curves,
             unlikely_weight=_UNLIKELY,
         )

@@ -203,7 +203,7 @@ def judge(searched: Searched, test: GlobalTest, *, unknown_weight: float = 1.0) 
 
     The probability of what is out of vocabulary counts `unknown_weight` times against all others.
     """
-    prepared, half = searched.prepared, searched.prior.named_needs_half
+    prepared = searched.prepared
     pairs = tuple(aliases_with_separating_plans(searched, test.problem, test.null.found))
     effects, certain = prepared.effects.values(), frozenset(searched.certain)
     on_noise = frozenset(e.name for e in effects if isinstance(e, NoiseEffect) and e.change_of_readings is None)
@@ -218,7 +218,7 @@ def judge(searched: Searched, test: GlobalTest, *, unknown_weight: float = 1.0) 
             return "cannot_tell", ()
         return verdict_and_combination(
             hypotheses, test.p_value, noise_names=on_noise, aliases=pairs, aliased_with=aliased_combinations,
-            certain=certain, named_needs_half=half,
+            certain=certain,
         )  # fmt: skip
 
     hypotheses, rare, (verdict, combination) = hypotheses_with_verdict(
@@ -226,7 +226,7 @@ def judge(searched: Searched, test: GlobalTest, *, unknown_weight: float = 1.0) 
     )
     forms, too_little = searched.probabilities_of_unknown_forms(besides=rare), prepared.has_too_little_data
     judged = Judged(verdict, combination, test.p_value, hypotheses, pairs, forms, too_little)
-    return with_shared_effects(judged, on_noise, certain=certain) if half and not too_little else judged
+    return judged if too_little else with_shared_effects(judged, on_noise, certain=certain)
 
 
 def hypotheses_with_verdict(
@@ -332,27 +332,23 @@ def verdict_and_combination(
     aliases: tuple[Alias, ...],
     aliased_with: Callable[[Names], frozenset[Names]],
     certain: frozenset[str] = frozenset(),
-    named_needs_half: bool = False,
 ) -> tuple[Verdict, Names]:
     """Return the verdict and the combination it names.
 
     Clean or unknown is the verdict if it has half the probability. Otherwise the most probable combination of effects
-    is `named` (`noise` if all its effects are on the noise). The verdict is `cannot_tell` instead,
+    on the mean, whatever effects on the noise are beside them, is `named` if it has half the probability. If all its
+    effects are on the noise, the verdict is `noise`. It is `cannot_tell` instead,
 
     - with half the probability or more, if one aliased with it (`aliased_with`) has over a fifth of its probability;
-    - with less, if it has half together with all that differ from it by one effect swapped for its alias (`aliases`);
+    - with less, of effects on the mean, or if it has half together with all that differ from it by one effect swapped
+      for its alias (`aliases`);
     - with less, if clean or unknown is more probable, or if there is no combination: then none is named;
     - if the p-value of the global test is above .01, of effects on the mean: then none is named, but those in
       `certain`, which the readings show beyond doubt.
-
-    With `named_needs_half`, effects on the mean count whatever effects on the noise are beside them, and need half the
-    probability to be `named`.
     """
     by_mean, fullest = dict[Names, float](), dict[Names, Names]()
     for hypothesis in sorted(hypotheses, key=lambda h: -h.probability):
-        mean = hypothesis.effects
-        if named_needs_half:  # those with effects on the noise alone stay apart
-            mean = _without(mean, noise_names) or mean
+        mean = _without(hypothesis.effects, noise_names) or hypothesis.effects  # those on the noise alone stay apart
         by_mean[mean] = by_mean.get(mean, 0.0) + hypothesis.probability
         fullest.setdefault(mean, hypothesis.effects)
     unknown, clean = by_mean.get(UNKNOWN, 0.0), by_mean.get((), 0.0)
@@ -376,7 +372,7 @@ def verdict_and_combination(
     combination = fullest.get(top, top)
     if verdict == "named" and {*top} <= noise_names:
         return "noise", combination
-    if verdict == "named" and named_needs_half and named[top] < 0.5:
+    if verdict == "named" and named[top] < 0.5:
         return "cannot_tell", combination
     doubtful = verdict == "named" and not {*combination} <= noise_names | certain
     return ("cannot_tell", ()) if doubtful and p_value > ALARM else (verdict, combination)

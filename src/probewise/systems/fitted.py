@@ -17,20 +17,17 @@ from probewise._arrays import BoolArray, FloatArray
 from probewise._kinds import checked_texts, require_kind
 from probewise._posterior_samples import NamedSamples, interval_table_lines
 from probewise._version import __version__
-from probewise.effects import EFFECTS, name_without_copy_suffix
+from probewise.effects import EFFECTS
 from probewise.errors import FileError, ParameterError, message_of, printable, require
 from probewise.recordings import parse_json_file_text, write_text_atomically
 from probewise.recordings.io import read_text
 from probewise.recordings.table import csv_text, number_text
 from probewise.sensor import Stage
-from probewise.systems.forms import counts_from_far_origin
 from probewise.systems.forms.reference import StoredFit
 from probewise.systems.simulator import Simulator, fingerprint_of_text, run_simulator_text
 from probewise.systems.table import RunTable
 
 FORMAT = "system/1"
-_ORIGINS = 1  # rule by which effects on a recording far from 0 count: files of earlier versions, from 0, have none
-_BEND = 2  # rule by which a bend has its ends: files of earlier versions, without the sd that tells outliers, have less
 _WHAT = "a repaired.json or calibrated.json of `probewise diagnose --simulator`, or a fitted.json of `probewise fit`"
 
 
@@ -119,13 +116,6 @@ class FittedSystem(NamedSamples):
             lines = [f"{line:<{width}}  {mode}" for line, mode in zip(lines, modes, strict=True)]
         return "\n".join(lines)
 
-    @property
-    def _rules(self) -> dict[str, int]:
-        """Rules by which its effects count and bend, by their keys in files: those of earlier versions mean others."""
-        is_far = self.known is not None and counts_from_far_origin(self.effects, self.simulator, self.known)
-        is_bent = any(name_without_copy_suffix(name) == "nonlinearity" for name in self.effects)
-        return ({"origins": _ORIGINS} if is_far else {}) | ({"bend": _BEND} if is_bent else {})
-
     def to_json(self) -> str:
         """Serialise as strict JSON, format "system/1"."""
         known = self.known
@@ -157,7 +147,6 @@ class FittedSystem(NamedSamples):
             **({"mode": self.mode()} if self.best else {}),
             "level": list(self.level),
             "bound_about": bound_about,
-            **self._rules,
             "notes": list(self.notes),
             "samples": self.samples.tolist(),
         }
@@ -170,7 +159,7 @@ class FittedSystem(NamedSamples):
         """Parse the text from `to_json`; error messages name `path`.
 
         A simulator given as its file, FILE.py, is run only if its fingerprint is that of the text. Raises FileError if
-        the text is damaged, has another format, belongs to another simulator, or is of an earlier version's rules.
+        the text is damaged, has another format, or belongs to another simulator.
         """
         document = parse_json_file_text(str(path), text, _WHAT)
         found = document.get("format") if isinstance(document, dict) else None
@@ -197,7 +186,7 @@ class FittedSystem(NamedSamples):
                 {name: _column_from_json(values) for name, values in bound["states"].items()},
                 tuple(bound["held"]),
             )
-            fitted = cls(
+            return cls(
                 simulator,
                 names=tuple(each["name"] for each in document["parameters"]),
                 samples=samples,
@@ -214,12 +203,6 @@ class FittedSystem(NamedSamples):
                 notes=tuple(document["notes"]),
                 version=str(document["version"]),
             )
-            for rule, number in fitted._rules.items():  # samples of a drift or of a phase would mean other ones
-                if (found := document.get(rule, 0)) != number:
-                    which = f"({rule} {found!r}), which counted from another origin, or whose bend had other ends"
-                    allowed = "a model written by this version; diagnose again"
-                    raise FileError(path, f"written by an earlier version {which}", allowed)
-            return fitted
         except FileError:
             raise
         except (KeyError, IndexError) as error:

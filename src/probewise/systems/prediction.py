@@ -376,19 +376,13 @@ def _chain_samples_and_whether_drawn(
     """Arrange the samples by the columns of a chain, (n_samples, n_params); also return whether any were drawn."""
     at = {name: k for k, name in enumerate(fitted.names)}
     n, system, is_drawn = len(fitted.samples), chain.system, False
-    fixed = {f"{form.name}.{name}" for form in chain.effects for name in getattr(form, "fixed", ())}
     out = np.empty((n, len(chain.names)))
-    of_effects = [name for name in at if any(name.startswith(f"{own}.") for own in fitted.effects)]
-    # Of a model of an earlier version; a variant that it did not take, 0 to 1e-9, changes nothing.
-    unknown = (name for name in of_effects if name not in chain.names)
-    lost = next((name for name in unknown if np.abs(fitted.samples[:, at[name]]).max() > 1e-6), None)
+    of_effects = (name for name in at if any(name.startswith(f"{own}.") for own in fitted.effects))
+    lost = next((name for name in of_effects if name not in chain.names), None)
     require(lost is None, "names", lost, "a parameter that this version knows; diagnose again with it")
     for k, name in enumerate(chain.names):
         if name in at:
             out[:, k] = fitted.samples[:, at[name]]
-            continue
-        if name in fixed:  # a file of an earlier version lacks it
-            out[:, k] = 0.0
             continue
         is_drawn, prior = True, system.marginals.get(name)
         effect = next((own for own in fitted.effects if has_value_per_run(own) and name.startswith(f"{own}.")), None)

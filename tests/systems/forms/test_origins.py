@@ -1,6 +1,5 @@
 """Times and columns far from 0, as seconds of the epoch are: effects are what they are on a clock that starts at 0."""
 
-import json
 
 import numpy as np
 import pytest
@@ -9,7 +8,6 @@ from heater import known_model
 from probewise.diagnosis import diagnose_system
 from probewise.effects import name_without_copy_suffix
 from probewise.effects.effect import sentence_from_samples
-from probewise.errors import FileError
 from probewise.systems import FittedSystem, Law, RunTable, Simulator, System, predict_system
 from probewise.systems.forms import ReferenceFit, bind_forms, extract_stored_fit
 from probewise.systems.forms.formulas import formula_forms
@@ -159,30 +157,3 @@ def test_a_recording_by_the_epoch_has_the_diagnosis_of_the_same_recording_from_0
     for effects, probability in expected.items():
         if probability > 0.01:
             assert found[effects] == pytest.approx(probability, abs=2e-3)
-
-
-def _model(about, effect):
-    form = bind_forms(about)[effect]
-    own = {f"{effect}.{name}": value for name, value in zip(form.prior.names, form.bank()[0, 0], strict=True)}
-    return known_model(about.system.simulator, {"offset": 1.0, "gain": 2.0, **own}, extract_stored_fit(about), sd=0.01)
-
-
-@pytest.mark.parametrize(("shift", "far", "effect"), [(EPOCH, 0.0, "offset_drift"), (0.0, FAR, "periodic_error:drive")])
-def test_a_model_of_a_version_that_counted_from_0_is_refused_where_its_effects_count_from_elsewhere(shift, far, effect):
-    """Its drifts and phases would be off by any amount; before, those of a column far from 0 were read."""
-    about = _about(shift, far, _function)
-    document = json.loads(_model(about, effect).to_json())
-    assert document.pop("origins") == 1
-    with pytest.raises(FileError, match=r"origins 0\).*diagnose again"):
-        FittedSystem.from_json(json.dumps(document), about.system.simulator)
-
-
-@pytest.mark.parametrize(
-    ("shift", "far", "effect"), [(EPOCH, FAR, "lag"), (0.0, 0.0, "offset_drift"), (0.0, FAR, "lag")]
-)
-def test_a_model_of_an_earlier_version_whose_effects_do_not_count_from_elsewhere_is_read(shift, far, effect):
-    """Its file is as it was; before, one that held a lag alone was refused, as its times are far from 0."""
-    about = _about(shift, far, _function)
-    text = _model(about, effect).to_json()
-    assert "origins" not in json.loads(text)
-    assert FittedSystem.from_json(text, about.system.simulator).effects == (effect,)

@@ -155,11 +155,6 @@ def rebind_forms(
     return {name: found[name] for name in wanted if name in found}
 
 
-def counts_from_far_origin(names: Iterable[str], simulator: Simulator, known: StoredFit) -> bool:
-    """Return whether any of these forms counts a time or a column of the recording from an origin other than 0."""
-    return any(form.counted_from for form in _bind_wanted_forms(list(names), simulator, known).values())
-
-
 def _bind_wanted_forms(wanted: list[str], simulator: Simulator, known: StoredFit) -> dict[str, Form]:
     if not wanted:
         return {}

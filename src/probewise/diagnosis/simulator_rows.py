@@ -16,6 +16,7 @@ from probewise.diagnosis.fit import Fit, Model, Null
 from probewise.diagnosis.locate import Covariate
 from probewise.diagnosis.words import join_names
 from probewise.effects import Effect, Extent, LightEffect, NoiseEffect, noise
+from probewise.effects.effect import TWICE
 from probewise.recordings.plan import Plan, Recording
 from probewise.systems import RunTable, Simulator, System
 from probewise.systems.forms import (
@@ -27,7 +28,6 @@ from probewise.systems.forms import (
 )
 from probewise.systems.forms.formulas import formula_forms
 from probewise.systems.forms.modulations import time_since_start_of_run
-from probewise.systems.forms.reference import TWICE
 from probewise.systems.table import append_tables, covariate_of_column, unused_name
 
 _LEAST_ROWS = 4

@@ -8,8 +8,8 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, partial
-from itertools import pairwise
-from typing import Any, ClassVar, Literal, Self, TypeAlias, TypeVar
+from itertools import combinations, pairwise
+from typing import Any, ClassVar, Literal, Self, TypeAlias, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -49,10 +49,8 @@ effect."""
 Declared: TypeAlias = Mapping[str, tuple[Marginal, str]]
 """Prior and unit of each parameter, by name."""
 
-
-def priors_and_units(parameters: Declared) -> tuple[dict[str, Marginal], tuple[str, ...]]:
-    """Return the priors by name, and the units."""
-    return {name: prior for name, (prior, _) in parameters.items()}, tuple(unit for _, unit in parameters.values())
+AMPLITUDE, POSITIVE = HeavyTailedPrior(1.0), HeavyTailedPrior(1.0, positive=True)
+"""Priors of amplitudes, of either sign or positive, until `Effect.of_typical_size` gives them their size."""
 
 
 def acting(formula: Callable[..., Any]) -> Act:
@@ -142,6 +140,36 @@ class Effect:
 
     has_change_point: ClassVar[bool] = False
     """Whether its variants are the intervals of a change point."""
+
+    @classmethod
+    def declared(
+        cls,
+        name: str,
+        stage: Stage,
+        parameters: Declared,
+        covariates: tuple[str, ...],
+        act: Act,
+        says: Say,
+        entries: FloatArray | None = None,
+        **more: Any,
+    ) -> Self:
+        """Return the effect of these parameters, priors and units; amplitudes are those declared as such, of size 1.
+
+        Without `entries` each parameter is an amplitude, and a column of the one entry.
+        """
+        priors, units = {own: prior for own, (prior, _) in parameters.items()}, tuple(u for _, u in parameters.values())
+        amplitudes = tuple(k for k, prior in enumerate(priors.values()) if prior is AMPLITUDE or prior is POSITIVE)
+        bank = np.eye(len(priors))[None] if entries is None else entries
+        return cls(name, stage, priors, units, covariates, act, bank, says, **{"amplitudes": amplitudes, **more})
+
+    def of_typical_size(self, typical: ArrayLike, *, misfit: float = 1.0) -> Self:
+        """Return the effect with amplitudes of this typical size, one for all or each; a misfit widens their tails."""
+        entries, priors = self.entries.copy(), dict(self.marginals)
+        entries[..., list(self.amplitudes)] *= np.asarray(typical, dtype=np.float64)
+        for k, size in zip(self.amplitudes, np.broadcast_to(typical, len(self.amplitudes)).tolist(), strict=True):
+            plain = cast(HeavyTailedPrior, priors[name := self.prior.names[k]])
+            priors[name] = replace(plain, typical=size, largest=plain.largest * max(misfit, 1.0))
+        return replace(self, parameters=priors, entries=entries)
 
     def __reduce__(self) -> tuple[Callable[..., Effect], tuple[Any, ...]]:
         state = {each.name: getattr(self, each.name) for each in fields(self)}
@@ -236,21 +264,39 @@ def _restored_effect(kind: type[Effect], state: dict[str, Any]) -> Effect:
     return kind(**state) if made is None else kind(**state, apply=made.apply, sentence=made.sentence)
 
 
+TWICE = 0.1
+"""Odds of a second wave, given one, and of a step that goes back: machines and climates that have a cycle often have
+another one."""
+
+_BLOCK_ENDS, _FEW_BLOCK_ENDS = 64, 12  # intervals of an end: all, and as many as detection needs
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StepEffect(Effect):
     """An effect with a change point, its last parameter: a variant for each interval in which that may lie.
 
-    With `is_thinned` False, all intervals are needed to detect it: its moment is what identifies it.
+    With `is_thinned` False, all intervals are needed to detect it: its moment is what identifies it. If it may go back,
+    its end is the parameter before, of prior `never` where it stays. In `most_ends` intervals a block of rows may begin
+    or end; all blocks have a tenth of the odds of all steps.
     """
 
     change_points: ChangePoints
     is_thinned: bool = True
+    never: Fixed | None = None
+    most_ends: int = _BLOCK_ENDS
     has_change_point: ClassVar[bool] = True
 
-    @property
+    @cached_property
     def places(self) -> Sequence[tuple[Uniform, ...]]:
-        """The prior of the last parameters, those that are a place, in each variant."""
-        return [(Uniform(*interval),) for interval in self.change_points.intervals]
+        """The priors of the last parameters, those that are a place, in each variant."""
+        begins = self.change_points.intervals
+        if self.never is None:
+            return [(Uniform(*begin),) for begin in begins]
+        thinner = replace(self.change_points, at=thinned(np.array(self.change_points.at), self.most_ends))
+        blocks = list(combinations(thinner.intervals, 2))
+        never = replace(self.never, odds=max(len(blocks), 1) / (TWICE * len(begins)))
+        steps = [(never, Uniform(*begin)) for begin in begins]
+        return [*steps, *((Uniform(*end), Uniform(*begin)) for begin, end in blocks)]
 
     @cached_property
     def _variants(self) -> tuple[Effect, ...]:
@@ -263,7 +309,8 @@ class StepEffect(Effect):
         return tuple(out)
 
     def with_fewer_variants(self) -> Self:
-        return replace(self, change_points=self.change_points.fewer()) if self.is_thinned else self
+        fewer = self.change_points.fewer()
+        return replace(self, change_points=fewer, most_ends=_FEW_BLOCK_ENDS) if self.is_thinned else self
 
     def variant_masks(self, plan: Any) -> VariantMasks | None:
         """Return the masks of the rows from each candidate change point on, or to its end; None where a law goes on.
@@ -279,10 +326,10 @@ class StepEffect(Effect):
         return always, (along > begin) & ((along < end) | (end <= begin))
 
     def redraw_by_variant(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
-        low, high = np.transpose(self.change_points.intervals)
+        low, high = np.array([[(prior.low, prior.high) for prior in last] for last in self.places]).transpose(2, 0, 1)
         chosen = rng.choice(len(weights), len(theta), p=weights)
-        drawn = low[chosen] + (high - low)[chosen] * rng.random(len(theta))
-        return np.concatenate([theta[:, :-1], drawn[:, None]], axis=1)
+        drawn = low[chosen] + (high - low)[chosen] * rng.random((len(theta), low.shape[1]))
+        return np.concatenate([theta[:, : -low.shape[1]], drawn], axis=1)
 
 
 _ROW_BY_ROW = (Stage.OFFSET, Stage.GAIN, Stage.POSE)
@@ -353,46 +400,27 @@ class LightEffect:
     def bind(
         self,
         of: Extent,
-        parameters: Declared | tuple[Prior, tuple[str, ...]],
+        parameters: Declared,
         act: Act,
-        entries: FloatArray,
         says: Say,
+        entries: FloatArray | None = None,
         *,
+        typical: ArrayLike | None = None,
         kind: type[Effect] = Effect,
         scans: tuple[str, ...] = (),
         patterns: tuple[str, ...] = (),
         **more: Any,
     ) -> Effect:
-        """Return the effect with these parameters, or their prior and units, counting from the origin if it counts."""
+        """Return `Effect.declared` of amplitudes of a typical size, counting from the origin if it counts."""
         counted_from, at = "", of.origin if self.counts else ZERO
         if self.counts == "time" and at.time_s:
             counted_from = f"time counts from {at.time_s:.12g} s"
         elif self.counts == "place" and (at.x_mm or at.y_mm):
             counted_from = f"X and Y count from ({at.x_mm:g}, {at.y_mm:g}) mm"
-        prior, units = parameters if isinstance(parameters, tuple) else priors_and_units(parameters)
-        given = (self.name, self.stage, prior, units, self.covariates, act, entries, says)
         own = {"counted_from": counted_from, "where": Where(at, scans, patterns)}
-        return kind(*given, **{**own, "source": partial(_effect_there, self, of, scans), **more})
-
-    def linear(
-        self,
-        of: Extent,
-        units: Mapping[str, str],
-        typical: float,
-        act: Act,
-        says: Say,
-        *,
-        positive: bool = False,
-        sizes: Sequence[float] = (1.0,),
-        **more: Any,
-    ) -> Effect:
-        """Return the effect whose readings change in proportion to each parameter, by name in `units`.
-
-        `sizes`, in typical ones, are tried in turn.
-        """
-        parameters = {name: (HeavyTailedPrior(typical, positive=positive), unit) for name, unit in units.items()}
-        entries = (typical * np.array(sizes))[:, None, None] * np.eye(len(units))
-        return self.bind(of, parameters, act, entries, says, amplitudes=tuple(range(len(units))), **more)
+        more = {**own, "source": partial(_effect_there, self, of, scans), **more}
+        effect = kind.declared(self.name, self.stage, parameters, self.covariates, act, says, entries, **more)
+        return effect if typical is None else effect.of_typical_size(typical)
 
     def step(
         self, of: Extent, sizes: Mapping[str, tuple[float, str]], act: Act, says: Say, *, is_thinned: bool = True
@@ -406,13 +434,18 @@ class LightEffect:
             return None
         points, n = ChangePoints.of(of.plan.time_s), len(sizes)
         low, high = points.at[0], points.at[-1]
-        parameters: dict[str, tuple[Marginal, str]]
-        parameters = {name: (HeavyTailedPrior(size), unit) for name, (size, unit) in sizes.items()}
-        parameters["at_s"] = Uniform(low, high), "s"
-        entries = np.column_stack([np.diag([size for size, _ in sizes.values()]), np.full(n, (low + high) / 2)])
-        own = (of, parameters, lambda value, theta, plan: act(value, theta, plan.time_s > theta[:, -1:]), entries[None])
-        more: dict[str, Any] = {"amplitudes": tuple(range(n)), "change_points": points, "is_thinned": is_thinned}
-        return self.bind(*own, says, kind=StepEffect, **more)
+        amplitudes: Declared = {name: (AMPLITUDE, unit) for name, (_, unit) in sizes.items()}
+        return self.bind(
+            of,
+            {**amplitudes, "at_s": (Uniform(low, high), "s")},
+            lambda value, theta, plan: act(value, theta, plan.time_s > theta[:, -1:]),
+            says,
+            np.column_stack([np.eye(n), np.full(n, (low + high) / 2)])[None],
+            typical=[size for size, _ in sizes.values()],
+            kind=StepEffect,
+            change_points=points,
+            is_thinned=is_thinned,
+        )
 
 
 def _effect_there(kind: LightEffect, of: Extent, scans: tuple[str, ...]) -> Effect:

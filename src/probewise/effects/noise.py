@@ -21,7 +21,6 @@ from probewise.effects.effect import (
     acting,
     in_words,
     light_effect,
-    priors_and_units,
 )
 from probewise.effects.noise_distribution import FittedReadings
 from probewise.effects.reference import Extent
@@ -48,9 +47,9 @@ def _on_noise(
     """Return an effect with nodes of its prior: midpoints of `n_nodes` equal shares along each parameter."""
     axes = [(np.arange(n) + 0.5) / n for n in n_nodes]
     u = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, len(axes))
-    entries = Product(priors_and_units(parameters)[0]).from_unit_cube(u)[:, None, :]
-    nodes = n_nodes if from_prior else ()
-    return kind.bind(of, parameters, act, entries, says, kind=NoiseEffect, nodes_per_parameter=nodes, **more)
+    entries = Product({name: prior for name, (prior, _) in parameters.items()}).from_unit_cube(u)[:, None, :]
+    more = {"amplitudes": (0,), "nodes_per_parameter": n_nodes if from_prior else (), **more}
+    return kind.bind(of, parameters, act, says, entries, kind=NoiseEffect, **more)
 
 
 SD_FACTORS = LogUniform(0.25, 6.0)  # prior of the noise sd since the calibration, in units of the sd then

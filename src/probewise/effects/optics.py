@@ -13,6 +13,8 @@ import numpy as np
 
 from probewise._arrays import TINY, FloatArray
 from probewise.effects.effect import (
+    AMPLITUDE,
+    POSITIVE,
     Act,
     Declared,
     Effect,
@@ -50,7 +52,7 @@ def edge_misplacement(kind: LightEffect, of: Extent) -> Effect:
     """Every pattern is shifted by offset_mm: along its normal (half-plane, stripes, ramp), or along X (all others)."""
     act = acting(lambda value, plan, mm: _with_shifted_patterns(value, mm * np.ones(len(plan)), plan))
     says = in_words("the printed edges lie {0} mm from their described place, in all scans")
-    return kind.linear(of, {"offset_mm": "mm"}, of.small_shift_mm, act, says)
+    return kind.bind(of, {"offset_mm": (AMPLITUDE, "mm")}, act, says, typical=of.small_shift_mm)
 
 
 @light_effect("scan_misplacement", Stage.SCENE, "a misplaced pattern in one scan", ("scan", "slope"))
@@ -60,7 +62,7 @@ def scan_misplacement(kind: LightEffect, of: Extent) -> Effect | None:
     def in_scan(name: str) -> Effect:
         act = acting(lambda value, plan, mm: _with_shifted_patterns(value, mm * scan_indicator(plan, (name,)), plan))
         says = in_words(f"in {scans_in_words((name,))} the pattern lies {{0}} mm from where it lies in the others")
-        return kind.linear(of, {"offset_mm": "mm"}, of.small_shift_mm, act, says, scans=(name,))
+        return kind.bind(of, {"offset_mm": (AMPLITUDE, "mm")}, act, says, typical=of.small_shift_mm, scans=(name,))
 
     names = tuple(dict.fromkeys(of.plan.scan_names))
     return one_of([in_scan(name) for name in names]) if len(names) > 1 else None
@@ -203,8 +205,9 @@ def _patch(kind: LightEffect, of: Extent, size: str, unit: str, typical: float, 
             along = np.arange(line.low_mm, line.high_mm + r / 2, r)
             x, y = line.lab_coordinates_mm(along, np.zeros_like(along))
             patches.append(single_column_bank(typical, x, y, r))
-        prior, units = PatchPrior(size, typical, line), (unit, "mm", "mm", "mm")
-        return kind.bind(of, (prior, units), act, np.concatenate(patches), says)
+        parameters = dict.fromkeys((size, "x", "y", "r"), (AMPLITUDE, "mm")) | {size: (AMPLITUDE, unit)}
+        free = kind.bind(of, parameters, act, says, np.concatenate(patches), amplitudes=(0,))
+        return replace(free, parameters=PatchPrior(size, typical, line))
 
     return one_of([on_line(line) for line in distinct_scan_lines(of.plan)])
 
@@ -236,8 +239,8 @@ def albedo_gradient(kind: LightEffect, of: Extent) -> Effect:
 
     white = "the signal over white changes by {0} % per 100 mm along X and by {1} % per 100 mm along Y"
     says = f"{white}, that over black does not: the paper or its illumination is uneven"
-    units = {"per_mm_x": "1/mm", "per_mm_y": "1/mm"}
-    return kind.linear(of, units, 0.02 / of.length_mm, act, in_words(says, factors=(1e4, 1e4)))
+    slopes: Declared = {"per_mm_x": (AMPLITUDE, "1/mm"), "per_mm_y": (AMPLITUDE, "1/mm")}
+    return kind.bind(of, slopes, act, in_words(says, factors=(1e4, 1e4)), typical=0.02 / of.length_mm)
 
 
 @light_effect("albedo_patch", Stage.SCENE, "a stain on the paper", ("place",))
@@ -346,7 +349,7 @@ def height_gradient(kind: LightEffect, of: Extent) -> Effect:
 
     says = "the sensor's height above the surface {grows/shrinks} by {|0|} mm per 100 mm along X: the table slopes"
     typical = 0.01 * _nominal_height_mm(of.plan) / of.length_mm
-    return kind.linear(of, {"mm_per_mm": "mm/mm"}, typical, act, in_words(says, factors=(100,)))
+    return kind.bind(of, {"mm_per_mm": (AMPLITUDE, "mm/mm")}, act, in_words(says, factors=(100,)), typical=typical)
 
 
 @light_effect("height_offset", Stage.FOOTPRINT, "another sensor height in some scans", ("scan",))
@@ -362,7 +365,8 @@ def height_offset(kind: LightEffect, of: Extent) -> Effect | None:
             return footprint_at_added_height(value, added, plan)
 
         says = in_words(f"in {scans_in_words(scans)} the sensor hangs {{|0|}} mm {{higher/lower}} than in the others")
-        return kind.linear(of, {"mm": "mm"}, 0.01 * _nominal_height_mm(of.plan), act, says, scans=scans)
+        typical = 0.01 * _nominal_height_mm(of.plan)
+        return kind.bind(of, {"mm": (AMPLITUDE, "mm")}, act, says, typical=typical, scans=scans)
 
     return one_of([in_scans(scans) for scans in candidate_scan_groups(of.plan)])
 
@@ -380,7 +384,8 @@ def slow_sinking(kind: LightEffect, of: Extent) -> Effect:
     """
     act = acting(lambda value, plan, rate: footprint_at_added_height(value, rate * of.origin.hours(plan), plan))
     says = "the sensor {rises/sinks} by {|0|} % of its height per hour: it is loose in its holder"
-    return kind.linear(of, {"per_hour": "1/h"}, 0.01 / (of.duration_s / 3600), act, in_words(says, factors=(100,)))
+    words, typical = in_words(says, factors=(100,)), 0.01 / (of.duration_s / 3600)
+    return kind.bind(of, {"per_hour": (AMPLITUDE, "1/h")}, act, words, typical=typical)
 
 
 def _has_one_height(plan: Plan) -> bool:
@@ -404,7 +409,7 @@ def edge_blur(kind: LightEffect, of: Extent) -> Effect:
         return replace(value, var_u=value.var_u + wider, var_v=value.var_v + wider)
 
     says, typical = in_words("the printed edges are soft: blurred by {0} mm (sd)"), 0.02 * of.length_mm
-    return kind.linear(of, {"sd_mm": "mm"}, typical, act, says, positive=True, kind=_BlurEffect)
+    return kind.bind(of, {"sd_mm": (POSITIVE, "mm")}, act, says, typical=typical, kind=_BlurEffect)
 
 
 class _BlurEffect(Effect):
@@ -427,7 +432,7 @@ def halo(kind: LightEffect, of: Extent) -> Effect:
     radii = LogUniform(0.1 * of.length_mm, of.length_mm)
     parameters = {"share": (LogUniform(1e-3, 0.7), "1"), "r_mm": (radii, "mm")}
     bank = single_column_bank(0.02, sizes_inside(radii, 5, 1.2))
-    return kind.bind(of, parameters, act, bank, in_words(says, factors=(100,)))
+    return kind.bind(of, parameters, act, in_words(says, factors=(100,)), bank, amplitudes=(0,))
 
 
 def _with_more_gaussians(value: Footprint, weight: FloatArray, more: Footprint) -> Footprint:
@@ -461,7 +466,7 @@ def edge_shadow(kind: LightEffect, of: Extent) -> Effect:
 
 def edge_shadow_of_patterns(kind: LightEffect, of: Extent, patterns: tuple[str, ...]) -> Effect:
     """Return the shadow along the edges of these patterns, () for all."""
-    typical, widths = 0.01, LogUniform(0.01 * of.length_mm, of.length_mm / 3)
+    widths = LogUniform(0.01 * of.length_mm, of.length_mm / 3)
 
     def act(value: View, theta: FloatArray, plan: Plan) -> View:
         x_mm, y_mm = (np.broadcast_to(a, (len(a), len(plan))) for a in (value.poses.x_mm, value.poses.y_mm))
@@ -478,10 +483,12 @@ def edge_shadow_of_patterns(kind: LightEffect, of: Extent, patterns: tuple[str, 
     where = f"of an edge of pattern {', '.join(patterns)}" if patterns else "of an edge"
     looks = f"within {{1}} mm {where} the surface looks {{|0|}} % {{darker/brighter}} than the pattern explains"
     says = in_words(f"{looks}: the edge {{casts a shadow/reflects light}}", factors=(100,))
-    parameters: Declared = {"amp": (HeavyTailedPrior(typical), "1"), "w": (widths, "mm")}
-    bank = single_column_bank(typical, sizes_inside(widths, 6))
-    source = partial(edge_shadow_of_patterns, kind, of, patterns)
-    return kind.bind(of, parameters, act, bank, says, patterns=patterns, source=source)
+    parameters: Declared = {"amp": (AMPLITUDE, "1"), "w": (widths, "mm")}
+    bank, source = (
+        single_column_bank(1.0, sizes_inside(widths, 6)),
+        partial(edge_shadow_of_patterns, kind, of, patterns),
+    )
+    return kind.bind(of, parameters, act, says, bank, typical=0.01, patterns=patterns, source=source)
 
 
 def _groups_of_edged_patterns(plan: Plan) -> tuple[tuple[str, ...], ...]:
@@ -496,7 +503,7 @@ def _groups_of_edged_patterns(plan: Plan) -> tuple[tuple[str, ...], ...]:
 @light_effect("reflection", Stage.FOOTPRINT, "a reflection beside the spot", ("place", "edge_distance"))
 def reflection(kind: LightEffect, of: Extent) -> Effect:
     """`share` of the light comes from a copy of the footprint, displaced by (dx_mm, dy_mm) in the lab frame."""
-    typical, farthest_mm = 0.02, 0.5 * of.length_mm
+    farthest_mm = 0.5 * of.length_mm
 
     def act(value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
         share, dx, dy = np.clip(theta[:, :1, None], 0.0, 1.0), theta[:, 1:2, None], theta[:, 2:3, None]
@@ -507,8 +514,8 @@ def reflection(kind: LightEffect, of: Extent) -> Effect:
 
     angles, reach = 2 * math.pi * np.arange(_ANGLES) / _ANGLES, Uniform(-farthest_mm, farthest_mm)
     far = farthest_mm * np.array([0.2, 0.4, 0.8])[:, None]
-    share = HeavyTailedPrior(typical, positive=True), "1"
-    bank = single_column_bank(typical, (far * np.cos(angles)).ravel(), (far * np.sin(angles)).ravel())
+    bank = single_column_bank(1.0, (far * np.cos(angles)).ravel(), (far * np.sin(angles)).ravel())
     spot = "a second spot, {1} mm along X and {2} mm along Y from the first, contributes {0} % of the light"
     says = in_words(f"{spot}: a reflection", factors=(100,))
-    return kind.bind(of, {"share": share, "dx_mm": (reach, "mm"), "dy_mm": (reach, "mm")}, act, bank, says)
+    parameters: Declared = {"share": (POSITIVE, "1"), "dx_mm": (reach, "mm"), "dy_mm": (reach, "mm")}
+    return kind.bind(of, parameters, act, says, bank, typical=0.02)

@@ -11,7 +11,9 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise._words import value_with_sd
 from probewise.effects.effect import (
+    AMPLITUDE,
     PHASE,
+    POSITIVE,
     Declared,
     Effect,
     LightEffect,
@@ -25,7 +27,7 @@ from probewise.effects.effect import (
     single_column_bank,
 )
 from probewise.effects.reference import Extent, candidate_scan_groups, distinct_positions_mm, scan_indicator
-from probewise.priors import HeavyTailedPrior, LogUniform, Product, Uniform
+from probewise.priors import LogUniform, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.commanded import height_ratio
 from probewise.sensor.stages import Poses, Stage
@@ -62,7 +64,7 @@ def backlash(kind: LightEffect, of: Extent) -> Effect:
         return f"the arm comes to rest {side}: gear play of {whole} mm"
 
     act = acting(lambda value, plan, width: _moved(value, *(-(width / 2) * d for d in plan.direction_of_motion.T)))
-    return kind.linear(of, {"width_mm": "mm"}, of.small_play_mm, act, says, positive=True)
+    return kind.bind(of, {"width_mm": (POSITIVE, "mm")}, act, says, typical=of.small_play_mm)
 
 
 @light_effect("backlash", Stage.POSE, "backlash (play) of each axis", ("slope", "direction"))
@@ -91,7 +93,7 @@ def position_scale(kind: LightEffect, of: Extent) -> Effect:
 
     1 % is a typical error, which the SSF's width may absorb; a wrong wheel size makes tens of %.
     """
-    x_mm, y_mm, typical = of.origin.x_mm, of.origin.y_mm, 0.01
+    x_mm, y_mm = of.origin.x_mm, of.origin.y_mm
 
     def act(value: Poses, theta: FloatArray, plan: Plan) -> Poses:
         x, y = x_mm + (value.x_mm - x_mm) * (1 + theta[:, :1]), y_mm + (value.y_mm - y_mm) * (1 + theta[:, 1:2])
@@ -99,7 +101,8 @@ def position_scale(kind: LightEffect, of: Extent) -> Effect:
 
     says = "the arm moves {0} % too far along X and {1} % along Y: the scale of its positions is wrong"
     words = in_words(says, factors=(100, 100))
-    return kind.linear(of, {"x": "1", "y": "1"}, typical, act, words, sizes=(1, -30, -10, 10, 30))
+    sizes = np.array([1, -30, -10, 10, 30])[:, None, None] * np.eye(2)
+    return kind.bind(of, {"x": (AMPLITUDE, "1"), "y": (AMPLITUDE, "1")}, act, words, sizes, typical=0.01)
 
 
 _TURNED = "a wrong sensor angle in all scans"
@@ -109,7 +112,8 @@ _TURNED = "a wrong sensor angle in all scans"
 def orientation_error(kind: LightEffect, of: Extent) -> Effect:
     """The sensor is turned by deg more than was commanded, in all scans, anticlockwise: its SSF absorbs this."""
     says = in_words(f"in all scans the sensor is turned {_FURTHER}")
-    return kind.linear(of, {"deg": "deg"}, _TURN_DEG, lambda value, theta, _: _turned(value, np.radians(theta)), says)
+    act = acting(lambda value, plan, deg: _turned(value, np.radians(deg)))
+    return kind.bind(of, {"deg": (AMPLITUDE, "deg")}, act, says, typical=_TURN_DEG)
 
 
 @light_effect("scan_angle_error", Stage.POSE, "a wrong sensor angle in some scans", ("scan", "orientation"))
@@ -118,8 +122,9 @@ def scan_angle_error(kind: LightEffect, of: Extent) -> Effect | None:
 
     def in_scans(scans: tuple[str, ...]) -> Effect:
         act = acting(lambda value, plan, deg: _turned(value, np.radians(deg) * scan_indicator(plan, scans)))
-        says, sizes = in_words(f"in {scans_in_words(scans)} the sensor is turned {_FURTHER}"), (1, -8, 8, -14, 14)
-        return kind.linear(of, {"deg": "deg"}, _TURN_DEG, act, says, sizes=sizes, scans=scans)
+        says = in_words(f"in {scans_in_words(scans)} the sensor is turned {_FURTHER}")
+        sizes = single_column_bank(np.array([1, -8, 8, -14, 14]))
+        return kind.bind(of, {"deg": (AMPLITUDE, "deg")}, act, says, sizes, typical=_TURN_DEG, scans=scans)
 
     return one_of([in_scans(scans) for scans in candidate_scan_groups(of.plan)])
 
@@ -137,7 +142,7 @@ def sensor_tilt(kind: LightEffect, of: Extent) -> Effect:
 
     off = "the sensor's spot is off by {0} mm along X and {1} mm along Y"
     says = in_words(f"{off}, whatever the orientation: the sensor is tilted")
-    return kind.linear(of, {"dx_mm": "mm", "dy_mm": "mm"}, of.small_shift_mm, act, says)
+    return kind.bind(of, {"dx_mm": (AMPLITUDE, "mm"), "dy_mm": (AMPLITUDE, "mm")}, act, says, typical=of.small_shift_mm)
 
 
 @light_effect("bent_rails", Stage.POSE, "bent rails", ("place", "slope"), counts="place")
@@ -157,7 +162,8 @@ def bent_rails(kind: LightEffect, of: Extent) -> Effect:
         return f"the rails are bent: 10 mm from the origin the arm is off by {of_x} mm along X and {of_y} mm along Y"
 
     typical_mm = of.small_play_mm / max(0.5 * of.length_mm / _UNIT_MM, 1.0) ** 2
-    return kind.linear(of, dict.fromkeys(("x2_mm", "x3_mm", "y2_mm", "y3_mm"), "mm"), typical_mm, act, says)
+    sizes: Declared = dict.fromkeys(("x2_mm", "x3_mm", "y2_mm", "y3_mm"), (AMPLITUDE, "mm"))
+    return kind.bind(of, sizes, act, says, typical=typical_mm)
 
 
 @light_effect("missing_tooth", Stage.POSE, "a jump of the arm's position", ("place", "slope"))
@@ -166,7 +172,6 @@ def missing_tooth(kind: LightEffect, of: Extent) -> Effect | None:
 
     Between which two of the recorded positions of an axis it lies is a discrete choice; `axis` is 0 for X, 1 for Y.
     """
-    typical_mm = of.small_play_mm
 
     def act(value: Poses, theta: FloatArray, plan: Plan) -> Poses:
         along_y = theta[:, 2:3] > 0.5
@@ -179,9 +184,9 @@ def missing_tooth(kind: LightEffect, of: Extent) -> Effect | None:
 
     def between(low_mm: float, high_mm: float, axis: int) -> Effect:
         at, which = Uniform(low_mm, high_mm), Uniform(axis - 0.5, axis + 0.5)
-        entry = np.array([[[typical_mm, (low_mm + high_mm) / 2, float(axis)]]])
-        prior = Product({"amp_mm": HeavyTailedPrior(typical_mm), "at_mm": at, "axis": which})
-        return kind.bind(of, (prior, ("mm", "mm", "1")), act, entry, says)
+        parameters: Declared = {"amp_mm": (AMPLITUDE, "mm"), "at_mm": (at, "mm"), "axis": (which, "1")}
+        bank = single_column_bank(1.0, (low_mm + high_mm) / 2, float(axis))
+        return kind.bind(of, parameters, act, says, bank, typical=of.small_play_mm)
 
     places = [distinct_positions_mm(axis_mm) for axis_mm in (of.plan.x_mm, of.plan.y_mm)]
     thinned = [own[:: -(-len(own) // _MOST_PLACES)].tolist() for own in places]
@@ -209,7 +214,7 @@ def slow_turn(kind: LightEffect, of: Extent) -> Effect:
     """The sensor turns in its holder: orientation + deg_per_hour t, t the hours since the origin."""
     act = acting(lambda value, plan, rate: _turned(value, np.deg2rad(rate) * of.origin.hours(plan)))
     says = in_words("the sensor turns by {0} degrees per hour: it is loose in its holder")
-    return kind.linear(of, {"deg_per_hour": "deg/h"}, 2.0 / (of.duration_s / 3600), act, says)
+    return kind.bind(of, {"deg_per_hour": (AMPLITUDE, "deg/h")}, act, says, typical=2.0 / (of.duration_s / 3600))
 
 
 _PERIODIC = "a periodic position error of the arm"
@@ -221,7 +226,7 @@ def periodic_position_error(kind: LightEffect, of: Extent) -> Effect | None:
     shortest_mm, reach_mm = _shortest_period_and_range_mm(of.plan)
     if not reach_mm > 0:
         return None
-    typical_mm, longest_mm = of.small_shift_mm, 2 * reach_mm
+    longest_mm = 2 * reach_mm
 
     @acting
     def act(value: Poses, plan: Plan, amp: FloatArray, period: FloatArray, phase: FloatArray) -> Poses:
@@ -230,19 +235,19 @@ def periodic_position_error(kind: LightEffect, of: Extent) -> Effect | None:
 
     waves = np.linspace(1.0, longest_mm / 2 / shortest_mm, _N_PERIODS + 1)[1:]
     periods = np.append(longest_mm / 2 / waves, longest_mm / np.geomspace(1.05, 2.0, _N_LONG))
-    amp, period = HeavyTailedPrior(typical_mm, positive=True), LogUniform(shortest_mm, longest_mm)
-    parameters: Declared = {"amp_mm": (amp, "mm"), "period_mm": (period, "mm"), "phase": (PHASE, "rad")}
-    bank = sine_and_cosine_entries(typical_mm, np.maximum(periods, shortest_mm * 1.001))
+    period = LogUniform(shortest_mm, longest_mm)
+    parameters: Declared = {"amp_mm": (POSITIVE, "mm"), "period_mm": (period, "mm"), "phase": (PHASE, "rad")}
+    bank = sine_and_cosine_entries(1.0, np.maximum(periods, shortest_mm * 1.001))
     off = "the arm's position along X is off by up to {0} mm, with a period of {1} mm"
     says = in_words(f"{off}: a gear or lead screw is not round")
-    return kind.bind(of, parameters, act, bank, says, kind=WaveEffect)
+    return kind.bind(of, parameters, act, says, bank, typical=of.small_shift_mm, kind=WaveEffect)
 
 
 @light_effect("stick_slip", Stage.POSE, "a slide that sticks and jumps", ("place", "slope"), counts="place")
 def stick_slip(kind: LightEffect, of: Extent) -> Effect | None:
     """Stick-slip: X + amp_mm saw((X - X0) / period_mm + phase), saw a sawtooth of 1 to -1, X0 of the origin."""
     shortest_mm, reach_mm = _shortest_period_and_range_mm(of.plan)
-    typical_mm, longest_mm = of.small_shift_mm, 0.25 * reach_mm
+    longest_mm = 0.25 * reach_mm
     if longest_mm <= shortest_mm:
         return None
 
@@ -253,11 +258,11 @@ def stick_slip(kind: LightEffect, of: Extent) -> Effect | None:
 
     waves = np.linspace(1.0 / longest_mm, 1.0 / shortest_mm, _N_WAVES + 2)[1:-1]
     periods, phases = np.meshgrid(1 / waves, np.arange(_N_PHASES) / _N_PHASES - 0.5, indexing="ij")
-    amp, period, phase = HeavyTailedPrior(typical_mm), LogUniform(shortest_mm, longest_mm), Uniform(-1.0, 1.0)
-    parameters: Declared = {"amp_mm": (amp, "mm"), "period_mm": (period, "mm"), "phase": (phase, "1")}
-    bank = single_column_bank(typical_mm, periods.ravel(), phases.ravel())
+    period, phase = LogUniform(shortest_mm, longest_mm), Uniform(-1.0, 1.0)
+    parameters: Declared = {"amp_mm": (AMPLITUDE, "mm"), "period_mm": (period, "mm"), "phase": (phase, "1")}
+    bank = single_column_bank(1.0, periods.ravel(), phases.ravel())
     says = "the slide sticks and then jumps by {|0|} mm, once every {1} mm along X: it lacks lubrication"
-    return kind.bind(of, parameters, act, bank, in_words(says, factors=(2,)))
+    return kind.bind(of, parameters, act, in_words(says, factors=(2,)), bank, typical=of.small_shift_mm)
 
 
 def _shortest_period_and_range_mm(plan: Plan) -> tuple[float, float]:

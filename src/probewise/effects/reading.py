@@ -7,8 +7,10 @@ import numpy as np
 from probewise._arrays import FloatArray, varies
 from probewise._words import value_with_sd
 from probewise.effects.effect import (
+    AMPLITUDE,
     MOST_FREQUENCIES,
     PHASE,
+    POSITIVE,
     Declared,
     Effect,
     LightEffect,
@@ -21,7 +23,7 @@ from probewise.effects.effect import (
     sizes_inside,
 )
 from probewise.effects.reference import Extent, sign_of_motion
-from probewise.priors import HeavyTailedPrior, LogHeavyTailedPrior, LogUniform, Uniform
+from probewise.priors import LogHeavyTailedPrior, LogUniform, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Stage
 
@@ -56,12 +58,11 @@ def nonlinearity(kind: LightEffect, of: Extent) -> Effect:
         of,
         {"gamma": (LogHeavyTailedPrior(0.1), "1")},
         acting(lambda value, plan, gamma: np.clip(value, 0.0, 1.0) ** gamma),
-        single_column_bank(np.exp([-0.1, 0.1])),
         lambda mean, sd: (
             f"the response is bent with exponent {value_with_sd(mean[0], sd[0])}: "
             f"a half-white view reads as {100 * 0.5 ** mean[0]:.1f} % white"
         ),
-        amplitudes=(),
+        single_column_bank(np.exp([-0.1, 0.1])),
         absent={0: 1.0},
     )
 
@@ -77,7 +78,8 @@ def dark_level(kind: LightEffect, of: Extent) -> Effect:
         way = "higher" if mean[0] > 0 else "lower"
         return f"since the calibration every reading is {value_with_sd(abs(mean[0]), sd[0])} {way}: other light"
 
-    return kind.linear(of, {"offset": "reading"}, of.small_change, lambda value, theta, _: value + theta[:, :1], says)
+    act = acting(lambda value, plan, offset: value + offset)
+    return kind.bind(of, {"offset": (AMPLITUDE, "reading")}, act, says, typical=of.small_change)
 
 
 @light_effect("gain", Stage.GAIN, _GAIN, ("level",), is_absorbed_by_ssf=lambda plan: True)
@@ -89,7 +91,8 @@ def gain(kind: LightEffect, of: Extent) -> Effect:
         way = "stronger" if mean[0] > 0 else "weaker"
         return f"since the calibration the signal is {changed} % {way}: the lamp, its battery or the paper"
 
-    return kind.linear(of, {"frac": "1"}, 0.02, lambda value, theta, _: value * np.maximum(1 + theta[:, :1], 0.0), says)
+    act = acting(lambda value, plan, frac: value * np.maximum(1 + frac, 0.0))
+    return kind.bind(of, {"frac": (AMPLITUDE, "1")}, act, says, typical=_SHARE)
 
 
 @light_effect("gain_drift", Stage.GAIN, "a gain that drifts", ("time",), counts="time")
@@ -102,9 +105,9 @@ def gain_drift(kind: LightEffect, of: Extent) -> Effect:
 
     says = "the signal starts {|0|} % {too strong/too weak} at time 0 and settles with a time constant of {1} s: "
     act = acting(lambda value, plan, frac, tau_s: value * (1 + frac * np.exp(-since(plan) / tau_s)))
-    parameters: Declared = {"frac": (HeavyTailedPrior(_SHARE), "1"), "tau_s": (taus, "s")}
-    bank = single_column_bank(_SHARE, sizes_inside(taus, 7))
-    return kind.bind(of, parameters, act, bank, in_words(f"{says}the lamp warms up", factors=(100,)))
+    parameters: Declared = {"frac": (AMPLITUDE, "1"), "tau_s": (taus, "s")}
+    words, bank = in_words(f"{says}the lamp warms up", factors=(100,)), single_column_bank(1.0, sizes_inside(taus, 7))
+    return kind.bind(of, parameters, act, words, bank, typical=_SHARE)
 
 
 @light_effect("battery_sag", Stage.GAIN, "a signal that follows the battery", (_BATTERY,), reads=(_BATTERY,))
@@ -121,7 +124,7 @@ def battery_sag(kind: LightEffect, of: Extent) -> Effect | None:
         return None
     says = "the signal {loses/gains} {|0|} % for each volt that the battery falls: the lamp follows the battery"
     act = acting(lambda value, plan, per_volt: value * (1 + per_volt * _volts_above_reference(plan)))
-    return kind.linear(of, {"per_volt": "1/V"}, _SHARE / fall, act, in_words(says, factors=(100,)))
+    return kind.bind(of, {"per_volt": (AMPLITUDE, "1/V")}, act, in_words(says, factors=(100,)), typical=_SHARE / fall)
 
 
 def _volts_above_reference(plan: Plan) -> FloatArray:
@@ -165,8 +168,8 @@ def polarisation(kind: LightEffect, of: Extent) -> Effect | None:
 
     if np.ptp(columns(of.plan), axis=1).max() <= _MOST_EQUAL:
         return None
-    units = {"cos_frac": "1", "sin_frac": "1"}
-    return kind.linear(of, units, _SHARE, lambda value, theta, plan: value * (1 + theta @ columns(plan)), says)
+    sizes: Declared = {"cos_frac": (AMPLITUDE, "1"), "sin_frac": (AMPLITUDE, "1")}
+    return kind.bind(of, sizes, lambda value, theta, plan: value * (1 + theta @ columns(plan)), says, typical=_SHARE)
 
 
 @light_effect("ambient_gradient", Stage.OFFSET, "stray light from one side", ("place",), counts="place")
@@ -174,11 +177,12 @@ def ambient_gradient(kind: LightEffect, of: Extent) -> Effect | None:
     """Stray light that grows across the table: reading + per_mm_x X + per_mm_y Y, lab frame, from the origin."""
     if not (varies(of.plan.x_mm) or varies(of.plan.y_mm)):
         return None
-    at, unit, units = of.origin, of.reading_unit, {"per_mm_x": "reading/mm", "per_mm_y": "reading/mm"}
+    at, unit = of.origin, of.reading_unit
+    slopes: Declared = {"per_mm_x": (AMPLITUDE, "reading/mm"), "per_mm_y": (AMPLITUDE, "reading/mm")}
     says = f"the reading changes by {{0}} per 100 mm along X and by {{1}} per 100 mm along Y, {_ALIKE}: stray light "
     words = in_words(f"{says}from one side", unit, unit, factors=(100, 100))
     act = acting(lambda value, plan, x, y: value + x * (plan.x_mm - at.x_mm) + y * (plan.y_mm - at.y_mm))
-    return kind.linear(of, units, of.small_change / of.length_mm, act, words)
+    return kind.bind(of, slopes, act, words, typical=of.small_change / of.length_mm)
 
 
 @light_effect("offset_drift", Stage.OFFSET, "a slow drift of all readings", ("time",), counts="time")
@@ -187,7 +191,7 @@ def offset_drift(kind: LightEffect, of: Extent) -> Effect:
     says = f"the reading {{rises/falls}} by {{|0|}} per hour, {_ALIKE}: the electronics or the room light drift"
     typical, words = of.small_change / (of.duration_s / 3600), in_words(says, of.reading_unit)
     act = acting(lambda value, plan, per_hour: value + per_hour * of.origin.hours(plan))
-    return kind.linear(of, {"per_hour": "reading/h"}, typical, act, words)
+    return kind.bind(of, {"per_hour": (AMPLITUDE, "reading/h")}, act, words, typical=typical)
 
 
 @light_effect("ambient_step", Stage.OFFSET, "a sudden change of the room light", ("time",))
@@ -204,21 +208,20 @@ def flicker(kind: LightEffect, of: Extent) -> Effect | None:
 
     The mains frequency aliased by the sampling, or a slow lamp: any frequency up to half the rate of readings.
     """
-    typical, highest = of.small_change, 0.5 / of.gap_s
+    highest = 0.5 / of.gap_s
     if highest <= _LOWEST_HZ:
         return None
     n = int(np.clip(np.ceil(2 * (highest - _LOWEST_HZ) * of.duration_s), 8, MOST_FREQUENCIES))
-
-    amp, alias_hz = HeavyTailedPrior(typical, positive=True), Uniform(_LOWEST_HZ, highest)
     return kind.bind(
         of,
-        {"amp": (amp, "reading"), "alias_hz": (alias_hz, "Hz"), "phase": (PHASE, "rad")},
+        {"amp": (POSITIVE, "reading"), "alias_hz": (Uniform(_LOWEST_HZ, highest), "Hz"), "phase": (PHASE, "rad")},
         acting(lambda value, plan, a, hz, at: value + a * np.sin(2 * np.pi * hz * of.origin.seconds(plan) + at)),
-        sine_and_cosine_entries(typical, np.linspace(_LOWEST_HZ, highest, n + 2)[1:-1]),
         lambda mean, sd: (
             f"the reading oscillates with an amplitude of {value_with_sd(mean[0], sd[0], of.reading_unit)} at "
             f"{value_with_sd(mean[1], sd[1])} Hz (a period of {1 / mean[1]:.4g} s), {_ALIKE}: a lamp flickers"
         ),
+        sine_and_cosine_entries(1.0, np.linspace(_LOWEST_HZ, highest, n + 2)[1:-1]),
+        typical=of.small_change,
         kind=WaveEffect,
     )
 
@@ -236,7 +239,7 @@ def hysteresis(kind: LightEffect, of: Extent) -> Effect | None:
     says = f"readings {way} are {{|0|}} {{higher/lower}} than those {other}, {_ALIKE}: hysteresis"
     words = in_words(says, of.reading_unit, factors=(more[-1] - least,))
     act = acting(lambda value, plan, amp: value + amp * sign_of_motion(plan))
-    return kind.linear(of, {"amp": "reading"}, of.small_change, act, words)
+    return kind.bind(of, {"amp": (AMPLITUDE, "reading")}, act, words, typical=of.small_change)
 
 
 @light_effect("lag", Stage.LAG, "a sensor that follows slowly", ("slope", "direction"))
@@ -256,7 +259,7 @@ def lag(kind: LightEffect, of: Extent) -> Effect:
     says = in_words("each reading keeps part of the previous one, with a time constant of {0} s: the electronics lag")
     parameters: Declared = {"tau_s": (LogUniform(shortest_s, longest_s), "s")}
     bank = single_column_bank(np.geomspace(shortest_s * 1.5, longest_s / 3, 7))
-    return kind.bind(of, parameters, act, bank, says, amplitudes=(), absent={0: 0.0})
+    return kind.bind(of, parameters, act, says, bank, absent={0: 0.0})
 
 
 @light_effect("overshoot", Stage.OFFSET, "an overshoot where the light grows", ("time", "direction", "level"))
@@ -280,9 +283,8 @@ def overshoot(kind: LightEffect, of: Extent) -> Effect | None:
         how = above if mean[0] > 0 else "{|0|} % of each rise of the signal comes late,"
         return in_words(f"{how} with a time constant of {{1}} s", factors=(100,))(mean, sd)
 
-    parameters: Declared = {"share": (HeavyTailedPrior(_SHARE), "1"), "tau_s": (taus, "s")}
-    bank = single_column_bank(_SHARE, sizes_inside(taus, 6))
-    return kind.bind(of, parameters, act, bank, says)
+    parameters: Declared = {"share": (AMPLITUDE, "1"), "tau_s": (taus, "s")}
+    return kind.bind(of, parameters, act, says, single_column_bank(1.0, sizes_inside(taus, 6)), typical=_SHARE)
 
 
 @light_effect("saturation", Stage.SATURATION, "readings cut off at a limit", ("level",))
@@ -302,11 +304,10 @@ def saturation(kind: LightEffect, of: Extent) -> Effect:
         of,
         {"level": (Uniform(lowest, highest), "reading"), "softness": (LogUniform(sharpest, softest), "reading")},
         acting(lambda value, plan, level, soft: level - soft * np.logaddexp(0.0, (level - value) / soft)),
-        np.array([*sharp, *soft])[:, None, :],
         lambda mean, sd: (
             f"no reading rises above {value_with_sd(mean[0], sd[0], unit)}: the electronics saturate, "
             f"from about {f'{mean[1]:.2g} {unit}'.rstrip()} below that limit"
         ),
-        amplitudes=(),
+        np.array([*sharp, *soft])[:, None, :],
         absent={0: highest + 100 * softest},
     )

@@ -31,7 +31,7 @@ from probewise.effects import (
     pose,
     reading,
 )
-from probewise.effects.effect import WrappedEffect
+from probewise.effects.effect import AMPLITUDE, WrappedEffect
 from probewise.effects.optics import PatchPrior
 from probewise.errors import ParameterError
 from probewise.experiment.noise_rivals import DeclaredNoise, noise_likelihoods
@@ -164,7 +164,7 @@ def _scale_of_axis(kind: LightEffect, of: Extent, axis: str, other: str) -> Effe
     def says(mean: FloatArray, sd: FloatArray) -> str:
         return _SCALE_SAYS.format(value_with_sd(mean[0], sd[0], factor=100), axis.upper(), other.upper())
 
-    return kind.linear(of, {axis: "1"}, 0.01, act, says)
+    return kind.bind(of, {axis: (AMPLITUDE, "1")}, act, says, typical=0.01)
 
 
 @light_effect("dark_level+gain", Stage.GAIN, "other levels than at the calibration", ("level",))
@@ -179,7 +179,7 @@ def dark_level_and_gain(kind: LightEffect, of: Extent) -> Effect:
         return f"{level.sentence(mean[:1], sd[:1])}; and {signal.sentence(mean[1:], sd[1:])}"
 
     priors = {**level.marginals, **signal.marginals}
-    return kind.bind(of, {name: (prior, "") for name, prior in priors.items()}, act, np.zeros((0, 1, 2)), says)
+    return kind.bind(of, {name: (prior, "") for name, prior in priors.items()}, act, says, np.zeros((0, 1, 2)))
 
 
 LEVELS_CHANGED = (reading.dark_level, reading.gain, dark_level_and_gain)

@@ -14,6 +14,7 @@ from probewise._words import unit_after_number
 from probewise.diagnosis import Diagnosis, Place
 from probewise.diagnosis.locate import figure_name_of
 from probewise.diagnosis.words import hypothesis_in_words
+from probewise.effects import Effect
 from probewise.recordings import Plan
 from probewise.report.covariates import (
     CovariateView,
@@ -28,7 +29,6 @@ from probewise.report.plots import residuals as plots
 from probewise.report.plots.canvas import BLUE, FILLED, AxesGrid, fit_to_room, stack_of_axes, svg
 from probewise.report.plots.probabilities import height_of_bars_in, hypothesis_probabilities
 from probewise.systems import RunTable
-from probewise.systems.forms import Form
 
 _WORTH_A_BAR = 0.005
 _MOST_BARS = 6
@@ -48,7 +48,7 @@ def figure_drawers(diagnosis: Diagnosis) -> dict[str, Callable[[], bytes]]:
     if gain.heldout_by_scan:
         mean_and_sd, part = (gain.heldout_log_density_per_reading, gain.heldout_sd), noun_of_held_out_part(diagnosis)
         drawers["gain.svg"] = lambda: svg(plots.heldout_gain_by_scan(gain.heldout_by_scan, *mean_and_sd, part=part))
-    for effect in cast(Sequence[Form], diagnosis.repaired.chain.effects):
+    for effect in cast(Sequence[Effect], diagnosis.repaired.chain.effects):
         if effect.name.startswith("curve:"):
             drawers[figure_name_of(effect.name)] = partial(_curve_svg, diagnosis, effect)
     return drawers | {place.figure_name: partial(_place_svg, chance, place) for place in diagnosis.where}
@@ -108,7 +108,7 @@ def _place_svg(chance: Callable[[], ResidualNoise], place: Place) -> bytes:
     return svg(axes)
 
 
-def _curve_svg(diagnosis: Diagnosis, curve: Form) -> bytes:
+def _curve_svg(diagnosis: Diagnosis, curve: Effect) -> bytes:
     """Draw a curve of a column, about its mean over the rows: its median, and the band of 95 % of the samples."""
     plan, reading = cast(RunTable, diagnosis.recording.plan), diagnosis.recording.plan.instrumentation
     (name, column), samples = curve.name.split(":", 1), diagnosis.repaired.effect_samples(curve.name)

@@ -13,19 +13,19 @@ from typing import Any
 import numpy as np
 
 from probewise.effects import AGAIN, PROPOSAL, name_without_copy_suffix
-from probewise.effects.effect import StepEffect, WaveEffect
+from probewise.effects.effect import Effect, StepEffect, WaveEffect
 from probewise.errors import require
 from probewise.priors import LogUniform
 from probewise.systems.forms.formulas import formula_forms
 from probewise.systems.forms.inputs import driving_columns, forms_on_inputs, forms_on_rates
 from probewise.systems.forms.modulations import forms_of_extras, forms_on_parameters
 from probewise.systems.forms.readings import forms_on_readings
-from probewise.systems.forms.reference import Form, ReferenceFit, StoredFit
+from probewise.systems.forms.reference import ReferenceFit, StoredFit
 from probewise.systems.simulator import Simulator
 from probewise.systems.system import System
 from probewise.systems.table import covariate_of_column
 
-__all__ = ["WORDS", "Form", "ReferenceFit", "StoredFit", "bind_forms", "driving_columns"]
+__all__ = ["WORDS", "ReferenceFit", "StoredFit", "bind_forms", "driving_columns"]
 
 WORDS: Mapping[str, str] = MappingProxyType(
     {
@@ -68,7 +68,7 @@ _IN_RATES = "rate", "damping", "drag", "friction", "forcing", "periodic_forcing"
 _IN_ORDER = frozenset({"offset_step", "gain_step", "steps", "hysteresis", "backlash", "lag", "delay", "input_delay"})
 
 
-def bind_forms(about: ReferenceFit) -> dict[str, Form]:
+def bind_forms(about: ReferenceFit) -> dict[str, Effect]:
     """Return every form that could be detectable near this fit, by name; each wave twice, as two may act."""
     named = [*forms_on_readings(about), *forms_on_inputs(about), *forms_on_parameters(about), *forms_on_rates(about)]
     if not about.rows_are_in_order:
@@ -81,7 +81,7 @@ def bind_forms(about: ReferenceFit) -> dict[str, Form]:
     return {form.name: form for form in [*found, *waves]}
 
 
-def _second_wave(form: Form) -> Form:
+def _second_wave(form: Effect) -> Effect:
     """Return a second wave; of a column it is the shorter, for two that are near its range are together a curve."""
     again, period = replace(form, name=form.name + AGAIN), form.marginals.get("period")
     if not isinstance(period, LogUniform):
@@ -133,7 +133,7 @@ def extract_stored_fit(about: ReferenceFit) -> StoredFit:
 
 def rebind_forms(
     names: Iterable[str], simulator: Simulator, known: StoredFit, *, more_runs: Iterable[str] = ()
-) -> dict[str, Form]:
+) -> dict[str, Effect]:
     """Bind the forms of these names to a recording again; return them by name, without names of other effects.
 
     `known` is the recording with the predictions of the fit to which they were bound; for `more_runs` outside it, forms
@@ -155,7 +155,7 @@ def rebind_forms(
     return {name: found[name] for name in wanted if name in found}
 
 
-def _bind_wanted_forms(wanted: list[str], simulator: Simulator, known: StoredFit) -> dict[str, Form]:
+def _bind_wanted_forms(wanted: list[str], simulator: Simulator, known: StoredFit) -> dict[str, Effect]:
     if not wanted:
         return {}
     system = System(simulator, known.table.scan_names)

@@ -16,9 +16,12 @@ import numpy as np
 from probewise._arrays import ROUNDING, FloatArray, varies
 from probewise._words import value_with_sd
 from probewise.effects.effect import (
+    AMPLITUDE,
     PHASE,
+    POSITIVE,
     ChangePoints,
     Declared,
+    Effect,
     StepEffect,
     WaveEffect,
     acting,
@@ -36,7 +39,7 @@ from probewise.systems.forms.modulations import (
     text_rounded_to_spread,
     trial_frequencies_in_time,
 )
-from probewise.systems.forms.reference import AMPLITUDE, ONE_AMPLITUDE, POSITIVE, Form, ReferenceFit, switch_points
+from probewise.systems.forms.reference import ReferenceFit, switch_points
 from probewise.systems.table import RunTable, covariate_of_column
 
 _MOST_SWITCHES = 128  # thresholds of a switch in a column
@@ -76,7 +79,7 @@ _Term: TypeAlias = tuple[str, tuple[_Variable, ...], Callable[..., Any], float]
 """A formula without its amplitude, its variables, and its value: a function of these, divided by a scale."""
 
 
-def formula_forms(about: ReferenceFit) -> Iterator[Form]:
+def formula_forms(about: ReferenceFit) -> Iterator[Effect]:
     """Yield all proposals: terms of the reading or of a state's rate, thresholds, and shapes in time or of a column."""
     own, table = about.system.simulator, about.table
     columns = {name: values for name, values in about.varying_columns.items() if np.isfinite(values).all()}
@@ -113,13 +116,13 @@ def _proposal(
     parameters: Declared,
     change: Callable[..., Any],
     covariates: tuple[str, ...],
-    entries: FloatArray = ONE_AMPLITUDE,
+    entries: FloatArray | None = None,
     *,
     guess: float | None = None,
     state: str = "",
     expression: str = "",
     **more: Any,
-) -> Iterator[Form]:
+) -> Iterator[Effect]:
     """Yield a formula of a name that ends in `text`; none if without effect.
 
     `change` is a function of the readings, the table and the parameters, (n_samples, 1) each: what is added to the
@@ -202,7 +205,7 @@ def _rounded_mean(values: FloatArray) -> float:
     return float(text_rounded_to_spread(float(np.mean(values)), float(np.std(values)), 6))
 
 
-def _threshold_form(about: ReferenceFit, name: str) -> Iterator[Form]:
+def _threshold_form(about: ReferenceFit, name: str) -> Iterator[Effect]:
     """Yield a shift of the reading where a column exceeds an unknown threshold with enough rows on either side."""
     points = switch_points(about.table.covariates[name][about.has_reading])
     if len(points) < 2:
@@ -220,7 +223,7 @@ def _threshold_form(about: ReferenceFit, name: str) -> Iterator[Form]:
     )
 
 
-def _one_sided_rate_forms(about: ReferenceFit, state: str) -> Iterator[Form]:
+def _one_sided_rate_forms(about: ReferenceFit, state: str) -> Iterator[Effect]:
     """Yield terms `a max(state - at, 0)` and `a max(at - state, 0)` of a state's rate, as of a stop or a spring."""
     values = about.states[state]
     points = switch_points(values)
@@ -234,7 +237,7 @@ def _one_sided_rate_forms(about: ReferenceFit, state: str) -> Iterator[Form]:
 
 def _forms_of_terms(
     about: ReferenceFit, terms: list[_Term], look_up: Callable[..., Any], at_rows: tuple[Any, Any], state: str = ""
-) -> Iterator[Form]:
+) -> Iterator[Effect]:
     """Yield terms of the reading or the rate of a state, unless infinite, constant or collinear with an earlier one.
 
     `look_up` finds a variable by its name in two values that an act gets, of which `at_rows` are those of the fit.
@@ -266,7 +269,7 @@ def _forms_of_terms(
         yield from _proposal(about, text, {"a": (AMPLITUDE, "")}, change, covariates, guess=guess, state=state)
 
 
-def _square_wave_form(about: ReferenceFit) -> Iterator[Form]:
+def _square_wave_form(about: ReferenceFit) -> Iterator[Effect]:
     """Yield a shift of the reading during a share of every period: flat tops, and edges of unknown steepness."""
     table, origin = about.table, origin_of_column(about.table.time_s)
     frequencies = trial_frequencies_in_time(about, _MOST_SQUARE_WAVES, _ROWS_OF_A_WAVE)
@@ -295,7 +298,7 @@ def _square_wave_form(about: ReferenceFit) -> Iterator[Form]:
     )
 
 
-def _swept_wave_form(about: ReferenceFit) -> Iterator[Form]:
+def _swept_wave_form(about: ReferenceFit) -> Iterator[Effect]:
     """Yield a sinusoid in the reading whose frequency rises or falls linearly along the recording."""
     table = about.table
     begin, end = float(table.time_s.min()), float(table.time_s.max())
@@ -325,7 +328,7 @@ def _swept_wave_form(about: ReferenceFit) -> Iterator[Form]:
     )
 
 
-def _varying_influence_form(about: ReferenceFit, name: str, values: FloatArray) -> Iterator[Form]:
+def _varying_influence_form(about: ReferenceFit, name: str, values: FloatArray) -> Iterator[Effect]:
     """Yield a form in which a column adds to the reading, by a coefficient quadratic in the reading."""
     own, level = about.system.simulator, about.predicted
     middle, half = 0.5 * float(level.max() + level.min()), 0.5 * float(np.ptp(level))
@@ -340,10 +343,10 @@ def _varying_influence_form(about: ReferenceFit, name: str, values: FloatArray) 
     scaled = f"({name} - {text_rounded_to_spread(centre, spread)}) / {spread:.4g}"
     text = f"(a + b z + c z^2) {scaled}, z = ({own.reading} - {text_rounded_to_spread(middle, half)}) / {half:.4g}"
     given = (text, dict.fromkeys("abc", (AMPLITUDE, own.unit)), change, (covariate_of_column(name), "level"))
-    yield from _proposal(about, *given, np.eye(3)[None, :, :], expression=text)
+    yield from _proposal(about, *given, expression=text)
 
 
-def _dose_forms(about: ReferenceFit, name: str, values: FloatArray) -> Iterator[Form]:
+def _dose_forms(about: ReferenceFit, name: str, values: FloatArray) -> Iterator[Effect]:
     """Yield changes of the reading that saturate with a dose: the integral of |column - mean|, or |column|."""
     table, centre, in_time = about.table, _rounded_mean(values), about.table.has_varying_time
     if not in_time and not about.rows_are_in_order:

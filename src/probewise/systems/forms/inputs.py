@@ -11,9 +11,12 @@ import numpy as np
 from probewise._arrays import ROUNDING, FloatArray, distinct_values, rounding_error
 from probewise._words import value_with_sd
 from probewise.effects.effect import (
+    AMPLITUDE,
     PHASE,
+    POSITIVE,
     Act,
     Declared,
+    Effect,
     Fixed,
     WaveEffect,
     acting,
@@ -32,7 +35,7 @@ from probewise.systems.forms.modulations import (
     trial_frequencies_in_time,
 )
 from probewise.systems.forms.readings import delayed_values, earlier_values, within_runs
-from probewise.systems.forms.reference import AMPLITUDE, POSITIVE, Form, ReferenceFit, clipping_between, period_with_sd
+from probewise.systems.forms.reference import ReferenceFit, clipping_between, period_with_sd
 from probewise.systems.law import LawWithEffects, Limit
 from probewise.systems.table import covariate_of_column
 
@@ -56,7 +59,7 @@ def driving_columns(about: ReferenceFit) -> list[str]:
     return out
 
 
-def forms_on_inputs(about: ReferenceFit) -> Iterator[Form]:
+def forms_on_inputs(about: ReferenceFit) -> Iterator[Effect]:
     """Yield a form for each possible error of the columns that drive the simulator, and of the clock."""
     for name in driving_columns(about):
         yield from _forms_on_column(about, name)
@@ -69,19 +72,19 @@ def forms_on_inputs(about: ReferenceFit) -> Iterator[Form]:
         yield from about.form(*own, guess=1e-5, counted_from=origin_in_words(time, origin, about.time_unit))
 
 
-def _forms_on_column(about: ReferenceFit, name: str) -> Iterator[Form]:
+def _forms_on_column(about: ReferenceFit, name: str) -> Iterator[Effect]:
     table, unit, column = about.table, about.time_unit, covariate_of_column(name)
     values = table.covariates[name]
     spread, span = float(np.nanstd(values)), float(np.nanmax(values)) - float(np.nanmin(values))
     true, late = f"the true {name} is the recorded {name}", ("previous", column)
 
-    def amplitude(kind: str, change: Act, guess: float, unit: str, says: str) -> Iterator[Form]:
+    def amplitude(kind: str, change: Act, guess: float, unit: str, says: str) -> Iterator[Effect]:
         own = (f"{kind}:{name}", Stage.INPUT, {"a": (AMPLITUDE, unit)}, (column,), _column_changer(name, change))
         return about.form(*own, in_words(says), guess=guess)
 
     def size(
         kind: str, act: Act, own: tuple[str, str], along: tuple[str, ...], says: str, **more: Any
-    ) -> Iterator[Form]:
+    ) -> Iterator[Effect]:
         tried = (about.duration if kind == "input_delay" else span) * np.geomspace(1e-7, 0.5, 40)
         return about.sized(f"{kind}:{name}", Stage.INPUT, own, along, act, in_words(says), tried, **more)
 
@@ -117,7 +120,7 @@ def _column_changer(name: str, change: Act) -> Act:
     return lambda value, theta, table: {**value, name: np.asarray(change(value[name], theta, table))}
 
 
-def _periodic_error_form(about: ReferenceFit, name: str) -> Iterator[Form]:
+def _periodic_error_form(about: ReferenceFit, name: str) -> Iterator[Effect]:
     column = about.table.covariates[name]
     values = column[np.isfinite(column) & about.has_reading]  # others resolve no wave: it would fit any readings
     if len(distinct_values(values)) < 3 * _ROWS_OF_A_WAVE:
@@ -167,7 +170,7 @@ def column_with_play(values: FloatArray, theta: FloatArray, time: FloatArray) ->
     return out
 
 
-def forms_on_rates(about: ReferenceFit) -> Iterator[Form]:
+def forms_on_rates(about: ReferenceFit) -> Iterator[Effect]:
     """Yield a form for each term that may be missing from the rate of a state, for friction and for bounds."""
     if not about.table.has_varying_time:  # nothing moves
         return
@@ -193,7 +196,7 @@ _TERMS: dict[str, tuple[Callable[[Any], Any], int, str]] = {
 """The term of each kind, of unit amplitude, as a function of a state; its degree in the state; and its words."""
 
 
-def _rate_term_form(about: ReferenceFit, name: str, state: str, other: str) -> Iterator[Form]:
+def _rate_term_form(about: ReferenceFit, name: str, state: str, other: str) -> Iterator[Effect]:
     kind = name.split(":")[0]
     (term, degree, what), in_time = _TERMS[kind], f"per {about.time_unit}"
     per = in_time if kind == "damping" else ""  # in a sentence; of another term it says more than it helps
@@ -220,7 +223,7 @@ def _unit_of_term(state: str, other: str, degree: int, time_unit: str) -> str:
     return f"{above}/{below}"
 
 
-def _friction_form(about: ReferenceFit, state: str) -> Iterator[Form]:
+def _friction_form(about: ReferenceFit, state: str) -> Iterator[Effect]:
     # A drive and the friction against it may each be far larger than what is left of the two, which moves the state.
     tried = _rms_rate(about, state) * np.geomspace(1e-6, 30.0, 31)
     act = acting(lambda motion, rows, a: motion.plus(friction={state: a}))
@@ -229,7 +232,7 @@ def _friction_form(about: ReferenceFit, state: str) -> Iterator[Form]:
     return about.sized(f"friction:{state}", Stage.RATE, size, (f"state:{state}", "level"), act, says, tried)
 
 
-def _periodic_forcing_form(about: ReferenceFit, state: str) -> Iterator[Form]:
+def _periodic_forcing_form(about: ReferenceFit, state: str) -> Iterator[Effect]:
     time, origin, per = str(about.table.time), origin_of_column(about.table.time_s), about.time_unit
     frequencies = trial_frequencies_in_time(about, max_n_trial_frequencies(len(about.table)))
 
@@ -247,7 +250,7 @@ def _periodic_forcing_form(about: ReferenceFit, state: str) -> Iterator[Form]:
     yield from about.form(name, Stage.RATE, act=act, says=says, guess=trial_rate(about, state), **own)
 
 
-def _limit_form(about: ReferenceFit, state: str) -> Iterator[Form]:
+def _limit_form(about: ReferenceFit, state: str) -> Iterator[Effect]:
     """Yield a bound of a state: the rate beyond it is lost, or a state that it drives takes up a share (overflow)."""
     ends = clipping_between(about.states[state])
     if ends is None:
@@ -268,7 +271,7 @@ def _limit_form(about: ReferenceFit, state: str) -> Iterator[Form]:
         taken = (f"; {other} takes up {share} of the rest" for other, share in shares.items())
         return says_where(mean, sd) + "".join(taken)
 
-    def variant(taking: str | None) -> Form:
+    def variant(taking: str | None) -> Effect:
         shares = {other: Uniform(0.0, 1.0) if other == taking else Fixed(0.0, ROUNDING) for other in others}
         own: Declared = {"level": (ends.prior, state)} | {f"share[{name}]": (p, "1") for name, p in shares.items()}
         bank = single_column_bank(ends.tried, *(0.5 * (other == taking) for other in others))

@@ -12,10 +12,13 @@ import numpy as np
 from probewise._arrays import ROUNDING, TINY, FloatArray, distinct_values
 from probewise._words import unit_of_name, value_with_sd
 from probewise.effects.effect import (
+    AMPLITUDE,
     MOST_FREQUENCIES,
     PHASE,
+    POSITIVE,
     Act,
     ChangePoints,
+    Effect,
     Fixed,
     StepEffect,
     WaveEffect,
@@ -25,16 +28,7 @@ from probewise.effects.effect import (
 from probewise.effects.reference import is_far_from_zero
 from probewise.priors import LogUniform, SharedScalePrior, Uniform
 from probewise.sensor import Stage
-from probewise.systems.forms.reference import (
-    AMPLITUDE,
-    POSITIVE,
-    UNSEEN,
-    BlockForm,
-    Form,
-    ReferenceFit,
-    flag,
-    period_with_sd,
-)
+from probewise.systems.forms.reference import UNSEEN, ReferenceFit, flag, period_with_sd
 from probewise.systems.table import RunTable, covariate_of_column
 
 _N_VALUES = 9
@@ -253,10 +247,10 @@ def change_point_step_modulation(about: ReferenceFit, what: str, unit: str, *, m
     declared = {"covariates": ("row",) if by_row else ("time",), "says": says, "change_points": change_points}
     if may_end:
         until, entries = {f"until_{place}": (never, of_place)}, np.array([[[1.0, first - 1.5, middle]]])
-        declared |= {"parameters": size | until | begin, "entries": entries, "kind": BlockForm, "never": never}
+        declared |= {"parameters": size | until | begin, "entries": entries, "never": never}
     else:
-        declared |= {"parameters": size | begin, "entries": np.array([[[1.0, middle]]]), "kind": StepEffect}
-    return Modulation(at_rows, declared)
+        declared |= {"parameters": size | begin, "entries": np.array([[[1.0, middle]]])}
+    return Modulation(at_rows, {**declared, "kind": StepEffect})
 
 
 def value_per_run_modulation(about: ReferenceFit, what: str, unit: str) -> Modulation:
@@ -275,8 +269,7 @@ def value_per_run_modulation(about: ReferenceFit, what: str, unit: str) -> Modul
         return f"{what} differs from run to run, most in run {names[far]}: by {by}"
 
     parameters = {f"values[{name}]": (AMPLITUDE, unit) for name in names}
-    own = {"parameters": parameters, "covariates": ("run",), "says": says, "entries": np.eye(len(names))[None]}
-    return Modulation(at_rows, own)
+    return Modulation(at_rows, {"parameters": parameters, "covariates": ("run",), "says": says})
 
 
 def modulations_over_rows(about: ReferenceFit) -> dict[str, Callable[..., Modulation]]:
@@ -320,7 +313,7 @@ def sinusoid_modulation(about: ReferenceFit, what: str, unit: str) -> Modulation
 
 def modulated_form(
     about: ReferenceFit, name: str, stage: Stage, how: Modulation, act: Act, guess: float, *covariates: str
-) -> Iterator[Form]:
+) -> Iterator[Effect]:
     """Yield the form by which a quantity varies over the rows as `how`, applied by `act`; none if without effect.
 
     Several values have one scale in common, unless they are so many that a single one could not differ much more than
@@ -347,7 +340,7 @@ _KINDS = {"drift": "drifts", "step": "steps", "per_run": "differs"}
 _QUARTILES = np.array([0.25, 0.75])
 
 
-def forms_on_parameters(about: ReferenceFit) -> Iterator[Form]:
+def forms_on_parameters(about: ReferenceFit) -> Iterator[Effect]:
     """Yield a form for each way in which a parameter may vary: drift, step, one value per run, with a column."""
     simulator, table = about.system.simulator, about.table
     values = about.system.parameters(about.theta, table)
@@ -355,7 +348,7 @@ def forms_on_parameters(about: ReferenceFit) -> Iterator[Form]:
     for name, prior in simulator.parameters.items():
         guess = 1e-4 * (float(np.abs(values[name]).max()) or float(np.ptp(prior.from_unit(_QUARTILES))))
 
-        def varied(form: str, how: Modulation, size: float, name: str = name) -> Iterator[Form]:
+        def varied(form: str, how: Modulation, size: float, name: str = name) -> Iterator[Effect]:
             def act(value: Any, theta: FloatArray, table: RunTable) -> Any:
                 return {**value, name: value[name] + how.at_rows(theta, table)}
 
@@ -371,7 +364,7 @@ def forms_on_parameters(about: ReferenceFit) -> Iterator[Form]:
             yield from varied(f"depends:{name}:{column}", how, guess / float(np.nanstd(table.covariates[column])))
 
 
-def forms_of_extras(about: ReferenceFit) -> Iterator[Form]:
+def forms_of_extras(about: ReferenceFit) -> Iterator[Effect]:
     """Yield a form for each extra effect of a file that changes the readings somewhere in its prior."""
     for name, extra in about.system.simulator.extra.items():
         values = np.asarray(extra.prior.from_unit((np.arange(_N_VALUES) + 0.5) / _N_VALUES))

@@ -12,10 +12,12 @@ from numpy.polynomial.chebyshev import chebfit, chebval
 from probewise._arrays import ROUNDING, BoolArray, FloatArray, distinct_values, rounding_error
 from probewise._words import value_with_sd
 from probewise.effects.effect import (
+    AMPLITUDE,
     LEAST_VISIBLE,
     ROWS_OF_A_SIDE,
     Act,
     Declared,
+    Effect,
     Fixed,
     acting,
     in_words,
@@ -34,7 +36,7 @@ from probewise.systems.forms.modulations import (
     sinusoid_modulation,
     time_since_start_of_run,
 )
-from probewise.systems.forms.reference import AMPLITUDE, N_SIZES, Clipping, Form, ReferenceFit, flag, switch_points
+from probewise.systems.forms.reference import N_SIZES, Clipping, ReferenceFit, flag, switch_points
 from probewise.systems.table import RunTable, covariate_of_column
 
 _SMOOTH = "smooth"  # name of the parameter that is 0 for the first variant, and 1 for the smooth one
@@ -63,7 +65,7 @@ def _cubics(time: FloatArray, values: FloatArray) -> FloatArray:
     return out
 
 
-def _late_form(about: ReferenceFit, name: str, act: Act, tried: FloatArray, says: str) -> Iterator[Form]:
+def _late_form(about: ReferenceFit, name: str, act: Act, tried: FloatArray, says: str) -> Iterator[Effect]:
     """Yield the form of a reading that comes late, with a smooth variant where rows tell it."""
 
     def at_rows(value: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
@@ -72,7 +74,7 @@ def _late_form(about: ReferenceFit, name: str, act: Act, tried: FloatArray, says
     prior = about.log_uniform_size_prior(Stage.LAG, at_rows, about.table.median_gap * tried)
     if prior is None:
         return
-    variants: list[Form] = []
+    variants: list[Effect] = []
     for is_smooth in (False, True):
         value, of_flag = flag(is_smooth, odds=_ODDS_OF_SMOOTH if is_smooth else 1.0)
         own: Declared = {"tau_s": (prior, about.time_unit), _SMOOTH: (of_flag, "1")}
@@ -172,16 +174,16 @@ def earlier_values(time: FloatArray, values: FloatArray, by: FloatArray, *, smoo
     return np.where(by[:, None] == 0, every, found)
 
 
-def forms_on_readings(about: ReferenceFit) -> Iterator[Form]:
+def forms_on_readings(about: ReferenceFit) -> Iterator[Effect]:
     """Yield every form of the reading that could be detectable in this table."""
     own, zero = about.system.simulator, about.system.simulator.noise.zero
     span = float(np.ptp(about.predicted)) or about.sd
 
-    def added(name: str, how: Modulation) -> Iterator[Form]:
+    def added(name: str, how: Modulation) -> Iterator[Effect]:
         own = (name, Stage.OFFSET, how, lambda y, theta, rows: y + how.at_rows(theta, rows), about.sd)
         return modulated_form(about, *own)
 
-    def scaled(name: str, how: Modulation) -> Iterator[Form]:
+    def scaled(name: str, how: Modulation) -> Iterator[Effect]:
         def act(value: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:
             return zero + (value - zero) * (1 + how.at_rows(theta, rows))
 
@@ -208,7 +210,7 @@ def forms_on_readings(about: ReferenceFit) -> Iterator[Form]:
     yield from _saturation_form(about)
 
 
-def _curve_form(about: ReferenceFit, name: str) -> Iterator[Form]:
+def _curve_form(about: ReferenceFit, name: str) -> Iterator[Effect]:
     """Yield a polynomial in a column scaled to [-1, 1]; its order, less than the number of values, is a variant."""
     column, reading, unit = about.table.covariates[name], about.system.simulator.reading, about.reading_unit
     low, high, n = float(np.nanmin(column)), float(np.nanmax(column)), len(_COEFFICIENTS)
@@ -225,13 +227,13 @@ def _curve_form(about: ReferenceFit, name: str) -> Iterator[Form]:
         said = " + ".join(f"({size}) z^{k}" if k > 1 else f"({size}) z" for k, size in enumerate(sizes, 1))
         return f"{reading} follows a curve of {name}: {said}, z from -1 at {name} = {low:.4g} to 1 at {high:.4g}"
 
-    own = (dict.fromkeys(_COEFFICIENTS, (AMPLITUDE, unit)), (covariate_of_column(name),), act, says, np.eye(n)[None])
+    own = (dict.fromkeys(_COEFFICIENTS, (AMPLITUDE, unit)), (covariate_of_column(name),), act, says)
     for whole in about.form(f"curve:{name}", Stage.OFFSET, *own):
         first, *others = (_up_to_order(whole, order, int(about.has_reading.sum())) for order in range(2, last + 1))
         yield replace(first, alternatives=tuple(others))
 
 
-def _up_to_order(curve: Form, order: int, n_read: int) -> Form:
+def _up_to_order(curve: Effect, order: int, n_read: int) -> Effect:
     """Return the variant of a curve whose higher coefficients are 0, and whose highest one can be seen.
 
     Otherwise it would be the curve of the order below, or a straight line, which has a name.
@@ -243,7 +245,7 @@ def _up_to_order(curve: Form, order: int, n_read: int) -> Form:
     return replace(curve, parameters=priors, entries=curve.entries[:, :order])
 
 
-def _friction_form(about: ReferenceFit, name: str) -> Iterator[Form]:
+def _friction_form(about: ReferenceFit, name: str) -> Iterator[Effect]:
     """Yield the friction of a column that moves both ways: a sign or, another variant, a smooth one."""
     column, unit = about.table.covariates[name][about.has_reading], about.reading_unit
     points, speeds = switch_points(column), np.sort(np.abs(column[column != 0]))
@@ -276,7 +278,7 @@ def settling_time_prior(about: ReferenceFit) -> LogUniform:
     return LogUniform(min(0.5 * about.table.median_gap, 0.01 * longest), 2 * longest)
 
 
-def _settling_form(about: ReferenceFit) -> Iterator[Form]:
+def _settling_form(about: ReferenceFit) -> Iterator[Effect]:
     prior, units = settling_time_prior(about), (about.reading_unit, about.time_unit)
     act = acting(lambda value, rows, a, tau_s: value + a * np.exp(-time_since_start_of_run(rows) / tau_s))
     says = "is off by {0} at the start of each run, and settles with a time constant of {1}"
@@ -307,14 +309,14 @@ def sign_of_change(values: FloatArray, table: RunTable) -> FloatArray:
     return out
 
 
-def _hysteresis_form(about: ReferenceFit) -> Iterator[Form]:
+def _hysteresis_form(about: ReferenceFit) -> Iterator[Effect]:
     if np.ptp(sign_of_change(about.predicted[None, :], about.table)) == 0:
         return
     own, way = about.system.simulator, "{more/less} while it rises than while it falls"
     says = in_words(f"{own.reading} reads {{|0|}} {way}", own.unit, factors=(2,))
     act = acting(lambda value, rows, a: value + a * sign_of_change(value, rows))
-    size, bank = {"a": (about.amplitude_prior(about.sd), own.unit)}, single_column_bank(about.sd)
-    yield from about.form("hysteresis", Stage.HYSTERESIS, size, ("previous",), act, says, bank, amplitudes=(0,))
+    size: Declared = {"a": (AMPLITUDE, own.unit)}
+    yield from about.form("hysteresis", Stage.HYSTERESIS, size, ("previous",), act, says, typical=about.sd)
 
 
 def _expected_readings_and_inliers(about: ReferenceFit) -> tuple[FloatArray, BoolArray]:
@@ -338,7 +340,7 @@ def _expected_readings_and_inliers(about: ReferenceFit) -> tuple[FloatArray, Boo
     return predicted + chebval(level, bend), there
 
 
-def _nonlinearity_form(about: ReferenceFit) -> Iterator[Form]:
+def _nonlinearity_form(about: ReferenceFit) -> Iterator[Effect]:
     expected = _expected_readings_and_inliers(about)[0]
     low, high = float(expected.min()), float(expected.max())
     if not low < high:
@@ -357,7 +359,7 @@ def _nonlinearity_form(about: ReferenceFit) -> Iterator[Form]:
     yield from about.form("nonlinearity", Stage.BEND, *own, guess=about.sd / (high - low))
 
 
-def _saturation_form(about: ReferenceFit) -> Iterator[Form]:
+def _saturation_form(about: ReferenceFit) -> Iterator[Effect]:
     low, high = float(about.predicted.min()), float(about.predicted.max())
     if not low < high:
         return

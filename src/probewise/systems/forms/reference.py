@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import combinations, permutations
-from typing import Any, Self, TypeAlias
+from itertools import permutations
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,13 +21,10 @@ from probewise.effects.effect import (
     Effect,
     Fixed,
     Say,
-    StepEffect,
     in_words,
-    priors_and_units,
     sizes_inside,
-    thinned,
 )
-from probewise.priors import HeavyTailedPrior, LogUniform, Uniform
+from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.calls import call_on_views
 from probewise.systems.integrate import integrate_states
@@ -46,48 +43,6 @@ _NUDGE = 1e-3  # of a state's range
 _N_COMPARED = 64  # states and parameters at which a rate is compared with another state
 N_SIZES = 9  # in the bank of a form of one size
 _LEAST, _MOST = 0.05, 1e4  # rms change in noise sds between which sizes without an amplitude are searched
-
-AMPLITUDE, POSITIVE = HeavyTailedPrior(1.0), HeavyTailedPrior(1.0, positive=True)
-"""Priors of amplitudes of a form before `ReferenceFit.scaled` finds their typical size: of either sign, or positive."""
-
-_BLOCK_ENDS, _FEW_BLOCK_ENDS = 64, 12  # intervals of an end: all, and as many as detection needs
-TWICE = 0.1
-"""Odds of a second wave, given one, and of a step that goes back: machines and climates that have a cycle often have
-another one."""
-
-Form: TypeAlias = Effect
-"""An effect that is bound to a target of a simulator: its act takes the table of the runs."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class BlockForm(StepEffect):
-    """A step that may go back: its last parameters are its end, of prior `never` where it stays, and its begin.
-
-    In so many intervals, `most`, a block of rows may begin or end; all blocks have a tenth of the odds of all steps.
-    """
-
-    never: Fixed
-    most: int = _BLOCK_ENDS
-
-    @cached_property
-    def places(self) -> Sequence[tuple[Uniform, ...]]:
-        """The priors of end and begin in each variant."""
-        begins, thinner = self.change_points.intervals, thinned(np.array(self.change_points.at), self.most)
-        blocks = list(combinations(replace(self.change_points, at=thinner).intervals, 2))
-        never = replace(self.never, odds=max(len(blocks), 1) / (TWICE * len(begins)))
-        steps = [(never, Uniform(*begin)) for begin in begins]
-        return [*steps, *((Uniform(*end), Uniform(*begin)) for begin, end in blocks)]
-
-    def with_fewer_variants(self) -> Self:
-        """Return the form with fewer begins and ends."""
-        return replace(self, change_points=self.change_points.fewer(), most=_FEW_BLOCK_ENDS)
-
-    def redraw_by_variant(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
-        """Redraw end and begin: a variant by `weights`, (n_variants,), each uniform within its interval."""
-        low, high = np.array([[(prior.low, prior.high) for prior in last] for last in self.places]).transpose(2, 0, 1)
-        chosen = rng.choice(len(weights), len(theta), p=weights)
-        drawn = low[chosen] + (high - low)[chosen] * rng.random((len(theta), 3))[:, 1:]
-        return np.concatenate([theta[:, :1], drawn], axis=1)
 
 
 def flag(on: bool, odds: float = 1.0) -> tuple[float, Fixed]:
@@ -191,9 +146,6 @@ def switch_points(values: FloatArray) -> FloatArray:
     least_values = np.minimum(values_below, len(distinct) - values_below) >= _VALUES_OF_A_SIDE
     at = np.flatnonzero(least_rows & least_values)
     return distinct[at[0] : at[-1] + 2] if at.size else distinct[:0]
-
-
-ONE_AMPLITUDE = np.ones((1, 1, 1))  # template bank
 
 
 @dataclass(frozen=True, eq=False)
@@ -353,12 +305,12 @@ class ReferenceFit:
     def change_of_readings(self, stage: Stage, act: Act, settings: FloatArray) -> FloatArray:
         """Return the readings' change, (n_settings, n_points), by `act` with parameters (n_settings, n_params)."""
         priors = dict.fromkeys(map(str, range(settings.shape[1])), Uniform(0.0, 1.0))  # it is not used
-        trial = Form("trial", stage, priors, (), (), act, settings, lambda mean, sd: "", amplitudes=())
+        trial = Effect("trial", stage, priors, (), (), act, settings, lambda mean, sd: "", amplitudes=())
         chain = replace(self.system.chain(self.table, ()), effects=(trial,))
         theta = np.concatenate([np.repeat(self.theta, len(settings), axis=0), settings], axis=1)
         return np.asarray(chain.predict(theta, self.table) - self.predicted)
 
-    def _typical_amplitude(self, form: Form, guess: float) -> float:
+    def _typical_amplitude(self, form: Effect, guess: float) -> float:
         """Find the amplitude at which the readings change by one sd (median over entries); 0 if they do not change."""
         settings, amplitudes = form.entries.reshape(-1, form.entries.shape[-1]), list(form.amplitudes)
         settings = settings[:: max(len(settings) // 16, 1)].copy()
@@ -382,36 +334,31 @@ class ReferenceFit:
         covariates: tuple[str, ...],
         act: Act,
         says: Say,
-        entries: FloatArray = ONE_AMPLITUDE,
+        entries: FloatArray | None = None,
         *,
         guess: float | None = None,
-        kind: type[Form] = Form,
+        typical: float | None = None,
+        kind: type[Effect] = Effect,
         **more: Any,
-    ) -> Iterator[Form]:
-        """Yield the form of these parameters, by name; none if it is without effect.
+    ) -> Iterator[Effect]:
+        """Yield `Effect.declared` of amplitudes of a typical size; none if it is without effect.
 
-        Those declared as AMPLITUDE or POSITIVE, of 1 in the `entries`, get their typical size. For it `guess`, by
-        default a noise sd, is an amplitude so small that the readings change in proportion.
+        Unless that is given, it is found from `guess`, by default a noise sd: an amplitude so small that the readings
+        change in proportion.
         """
-        priors, units = priors_and_units(parameters)
-        sizes = {own: prior for own, prior in priors.items() if prior is AMPLITUDE or prior is POSITIVE}
-        amplitudes = tuple(k for k, own in enumerate(priors) if own in sizes)
-        given = (name, stage, priors, units, covariates, act, entries, says)
-        form = kind(*given, **{"amplitudes": amplitudes, **more})
-        if not amplitudes:
+        form = kind.declared(name, stage, parameters, covariates, act, says, entries, **more)
+        if not form.amplitudes:
             yield form
             return
-        typical = self._typical_amplitude(form, self.sd if guess is None else guess)
+        if typical is None:
+            typical = self._typical_amplitude(form, self.sd if guess is None else guess)
         if np.isfinite(typical) and typical > 0:
-            scaled = entries.copy()
-            scaled[..., list(amplitudes)] *= typical
-            of_size = {own: self.amplitude_prior(typical, positive=prior is POSITIVE) for own, prior in sizes.items()}
-            yield replace(form, parameters=priors | of_size, entries=scaled)
+            yield form.of_typical_size(typical, misfit=self.misfit)
 
     def sized(
         self, name: str, stage: Stage, size: tuple[str, str], covariates: tuple[str, ...], act: Act, says: Say,
         tried: FloatArray, **more: Any,
-    ) -> Iterator[Form]:  # fmt: skip
+    ) -> Iterator[Effect]:  # fmt: skip
         """Yield a form of one size, of this name and unit, without a sign; none if none of those `tried` is plausible.
 
         Its prior is log-uniform over those that change the readings by 0.05 to 10,000 sds (rms), the latter times a
@@ -422,11 +369,6 @@ class ReferenceFit:
             entries, (parameter, unit) = sizes_inside(prior, N_SIZES, 1.2)[:, None, None], size
             own = (name, stage, {parameter: (prior, unit)}, covariates, act, says, entries)
             yield from self.form(*own, absent={0: 0.0}, **more)
-
-    def amplitude_prior(self, typical: float, *, positive: bool = False) -> HeavyTailedPrior:
-        """Return the heavy-tailed prior of an amplitude of this typical size; a misfit above 1 widens its tails."""
-        plain = HeavyTailedPrior(typical, positive=positive)
-        return replace(plain, largest=plain.largest * max(self.misfit, 1.0))
 
     def log_uniform_size_prior(self, stage: Stage, act: Act, tried: FloatArray) -> LogUniform | None:
         """Return the prior of `sized`; None if no size is plausible."""

@@ -1,6 +1,5 @@
 """Times and columns far from 0, as seconds of the epoch are: effects are what they are on a clock that starts at 0."""
 
-
 import numpy as np
 import pytest
 from heater import known_model

@@ -73,15 +73,15 @@ def test_counts_and_angles_agree_to_half_a_count(angle_rad, side):
 
 # What a person may get wrong in the file, the line to spoil it with, and what is said.
 SPOILED = [
-    ('format = "arm/1"', 'format = "arm/2"', "format is 'arm/2'; allowed: \"arm/1\""),
+    ('format = "arm/1"', 'format = "arm/2"', 'format is "arm/2"; allowed: "arm/1"'),
     ("x_mm = 524", "", "base.x_mm is missing"),
-    ("x_mm = 524", "x_mm = nan", "base.x_mm is nan"),
+    ("x_mm = 524", "x_mm = nan", "base.x_mm is NaN"),
     ("x_mm = 524", "x_mn = 524\nx_mm = 524", "base.x_mn is not known"),
     ("upper_mm = 350", "upper_mm = 0", "links_mm is 0.0; allowed: greater than 0"),
     ("port = 1\n", "port = 5\n", "sensor.port is 5; allowed: 1, 2, 3 or 4"),
     ("read_height_mm = 14", "read_height_mm = 70", "heights above 0, each above the one before"),
     ("whole_percent = true", "whole_percent = 1", "sensor.whole_percent is 1; allowed: true or false"),
-    ('port = "A"', 'port = "D"', "joints.base.port is 'D'"),
+    ('port = "A"', 'port = "D"', 'joints.base.port is "D"'),
     ('port = "A"', 'port = "B"', "a port of its own for each joint"),
     ("gear_ratio = 21", "gear_ratio = 0", "joints.base.gear_ratio is 0.0"),
     ("home_deg = -90", "home_deg = 90", "joints.base.home_deg is"),

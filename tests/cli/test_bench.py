@@ -5,50 +5,19 @@ import pytest
 from command import run
 
 from probewise.calibration import predict, read_sensor
-from probewise.cli._bench import shifted_pattern, world_and_scale
-from probewise.errors import ParameterError
-from probewise.recordings import (
-    Disc,
-    HalfPlane,
-    Image,
-    Plan,
-    Polygon,
-    Quadrant,
-    Ramp,
-    Stripes,
-    Uniform,
-    paper_plan,
-    read_recording,
-    write_plan,
-)
-
-ORIGIN = (300.0, 200.0)
-PATTERNS = [
-    Uniform(0.5),
-    HalfPlane(0.7, 3.0),
-    Quadrant((1.0, 2.0), (-1, 1)),
-    Disc((3.0, -2.0), 9.0),
-    Polygon(((0.0, 0.0), (9.0, 1.0), (4.0, 8.0))),
-    Stripes(0.7, 11.0, 0.4, 2.0),
-    Image(np.eye(4), 3.0, (-5.0, -6.0), "eye.png"),
-]
+from probewise.recordings import Plan, Ramp, Uniform, paper_plan, read_recording, write_plan
 
 
-@pytest.mark.parametrize("pattern", PATTERNS, ids=lambda pattern: type(pattern).__name__)
-def test_a_pattern_that_was_moved_reads_at_its_new_place_as_it_did_at_its_old(pattern):
-    world, _ = world_and_scale(None)
-    for x_mm, y_mm, turned_rad in ((0.0, 0.0, 0.0), (4.0, 1.0, 1.0), (-3.0, 6.0, 2.0)):
-        here = world.read(pattern, x_mm, y_mm, turned_rad, time_s=0.0, rng=None)
-        there = world.read(
-            shifted_pattern(pattern, ORIGIN), x_mm + 300.0, y_mm + 200.0, turned_rad, time_s=0.0, rng=None
-        )
-        assert there == pytest.approx(here, abs=1e-6)
-
-
-def test_a_ramp_stays_where_it_is():
-    assert shifted_pattern(Ramp(0.0, 0.1), (0.0, 0.0)) == Ramp(0.0, 0.1)
-    with pytest.raises(ParameterError, match="0,0 with a ramp"):
-        shifted_pattern(Ramp(0.0, 0.1), ORIGIN)
+def test_a_ramp_is_laid_where_its_origin_is_to_lie(tmp_path):
+    """A ramp of 1 in 100 mm, from 20 mm left of its origin: .3, .5, .7 of the way from black to white."""
+    ramp = Ramp(0.0, 0.01)
+    plan = Plan.from_arrays(x_mm=[30.0, 50.0, 70.0], y_mm=0.0, patterns=ramp, unit="LEGO")
+    write_plan(plan, tmp_path / "plan.csv")
+    words = ("arm", "record", tmp_path / "plan.csv", "--arm", "simulated", "--quiet", "--out", tmp_path / "r.csv")
+    assert run(*words, "--origin-mm", "524,260") == 0
+    low, middle, high = read_recording(tmp_path / "r.csv").readings
+    assert high - low == pytest.approx(0.4 * 47, abs=5)
+    assert middle == pytest.approx((low + high) / 2, abs=4)
 
 
 def test_what_the_simulated_arm_records_is_what_its_sensor_predicts(sensor_file, tmp_path):

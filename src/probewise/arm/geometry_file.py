@@ -5,21 +5,28 @@ from __future__ import annotations
 import math
 import re
 import tomllib
-from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from probewise._kinds import checked_path
 from probewise.arm.geometry import FITTED, JOINTS, Accuracy, Geometry, Joint
-from probewise.errors import FileError, ParameterError, shown
-from probewise.recordings.io import read_text
+from probewise.errors import FileError, ParameterError
+from probewise.recordings.io import FileObject, is_number_of_file, read_text
 
 FORMAT = "arm/1"
 _HEADER = re.compile(r"\s*\[\s*([\w.]+)\s*\]")
 _ENTRY = re.compile(r"(\s*(\w+)\s*=\s*)([-+\w.]+)(.*)")
-LARGEST = 1e6
-T = TypeVar("T")
+_LARGEST = 1e6  # magnitude of a number
+# Where the lengths of a geometry stand, table and entry.
+_PAIRS = {
+    "field_mm": (("field", "width_mm"), ("field", "height_mm")),
+    "axis_mm": (("base", "x_mm"), ("base", "y_mm")),
+    "shoulder_mm": (("base", "shoulder_forward_mm"), ("base", "shoulder_height_mm")),
+    "links_mm": (("links", "upper_mm"), ("links", "lower_mm")),
+    "sensor_mm": (("sensor", "forward_mm"), ("sensor", "drop_mm")),
+}
+_FITTED_PAIRS = ("axis_mm", "shoulder_mm", "links_mm")
 
 
 def shipped_geometry_path() -> Path:
@@ -41,40 +48,46 @@ def read_geometry(path: str | Path) -> Geometry:
         raise FileError(path, "tables or lists nested too deep", "an arm's geometry, TOML") from error
     except ValueError as error:  # not TOML, or a number of thousands of digits
         raise FileError(path, f"not TOML ({error})", "an arm's geometry, TOML") from error
-    top = _TomlTable(path, "", content)
+    top = FileObject(path, "", content, largest=_LARGEST)
     top.value("format", f'"{FORMAT}"', lambda v: v == FORMAT)
-    field, base, links, sensor = (top.table(name) for name in ("field", "base", "links", "sensor"))
-    joints = top.table("joints")
+    tables = {name: top.object(name) for name in ("field", "base", "links", "sensor", "joints")}
+    joints = {name: tables["joints"].object(name) for name in JOINTS}
+    links, sensor, known = tables["links"], tables["sensor"], top.object("accuracy") if "accuracy" in content else None
     elbow = links.value("elbow", '"absolute" or "relative"', lambda v: v in ("absolute", "relative"))
     port = sensor.value("port", "1, 2, 3 or 4", lambda v: v in (1, 2, 3, 4) and not isinstance(v, bool | float))
-    whole = sensor.value("whole_percent", "true or false", lambda v: isinstance(v, bool))
-    tables = {name: joints.table(name) for name in JOINTS}
-    known = top.table("accuracy") if "accuracy" in content else None
-    parts: dict[str, Any] = {name: _parse_joint(table) for name, table in tables.items()}
-    accuracy = None if known is None else _parse_accuracy(known)
-    geometry = _built(
-        top,
-        lambda: Geometry(
-            field_mm=(field.number("width_mm"), field.number("height_mm")),
-            axis_mm=(base.number("x_mm"), base.number("y_mm")),
-            shoulder_mm=(base.number("shoulder_forward_mm"), base.number("shoulder_height_mm")),
-            links_mm=(links.number("upper_mm"), links.number("lower_mm")),
-            elbow_is_relative=elbow == "relative",
-            sensor_port=port - 1,
-            sensor_mm=(sensor.number("forward_mm"), sensor.number("drop_mm")),
-            mounting_rad=math.radians(sensor.number("mounting_deg")),
-            read_height_mm=sensor.number("read_height_mm"),
-            travel_height_mm=sensor.number("travel_height_mm"),
-            lowest_mm=sensor.number("lowest_mm"),
-            **parts,
-            whole_percent=whole,
-            accuracy=accuracy,
-            light_per_mm=sensor.number("light_per_mm") if "light_per_mm" in sensor.content else None,
-        ),
-    )
-    for table in (top, field, base, links, sensor, joints, *tables.values(), *([] if known is None else [known])):
-        table.require_all_taken()
+    parts: dict[str, Any] = {
+        name: tuple(tables[table].number(entry) for table, entry in places) for name, places in _PAIRS.items()
+    }
+    parts |= {name: sensor.number(name) for name in ("read_height_mm", "travel_height_mm", "lowest_mm")}
+    parts["whole_percent"] = sensor.value("whole_percent", "true or false", lambda v: isinstance(v, bool))
+    parts["mounting_rad"] = math.radians(sensor.number("mounting_deg"))
+    parts["light_per_mm"] = sensor.number("light_per_mm") if "light_per_mm" in sensor.content else None
+    parts |= {name: _parse_joint(table) for name, table in joints.items()}
+    parts["accuracy"] = None if known is None else _parse_accuracy(known)
+    geometry = top.build(Geometry, elbow_is_relative=elbow == "relative", sensor_port=port - 1, **parts)
+    for table in (top, *tables.values(), *joints.values(), *([] if known is None else [known])):
+        table.require_none_unknown()
     return geometry
+
+
+def _parse_joint(table: FileObject) -> Joint:
+    port = table.value("port", '"A", "B" or "C"', lambda v: v in ("A", "B", "C"))
+    ratio = table.number("gear_ratio")
+    angles = [math.radians(table.number(f"{name}_deg")) for name in ("home", "low", "high", "play")]
+    stop = math.radians(table.number("stop_deg")) if "stop_deg" in table.content else None
+    return table.build(Joint, "ABC".index(port), ratio, *angles, stop)
+
+
+def _is_row(value: object) -> bool:
+    return isinstance(value, list) and all(is_number_of_file(number, _LARGEST) for number in value)
+
+
+def _parse_accuracy(table: FileObject) -> Accuracy:
+    marks = table.value("marks", "a whole number, 1 or more", lambda v: type(v) is int)
+    sds = [table.number(name) for name in ("place_sd_mm", "height_sd_mm", "scale_sd")]
+    allowed = "rows of numbers as `arm fit-geometry` writes them: fit the marks again, or leave [accuracy] out"
+    rows = table.value("covariance", allowed, lambda v: isinstance(v, list) and all(map(_is_row, v)))
+    return table.build(Accuracy, marks, *sds, tuple(tuple(map(float, row)) for row in rows))
 
 
 def text_with_fitted_values(text: str, geometry: Geometry) -> str:
@@ -85,12 +98,9 @@ def text_with_fitted_values(text: str, geometry: Geometry) -> str:
     inline table: it would stay.
     """
     numbers: dict[tuple[str, str], float] = {
-        ("base", "x_mm"): geometry.axis_mm[0],
-        ("base", "y_mm"): geometry.axis_mm[1],
-        ("base", "shoulder_forward_mm"): geometry.shoulder_mm[0],
-        ("base", "shoulder_height_mm"): geometry.shoulder_mm[1],
-        ("links", "upper_mm"): geometry.links_mm[0],
-        ("links", "lower_mm"): geometry.links_mm[1],
+        place: length
+        for pair in _FITTED_PAIRS
+        for place, length in zip(_PAIRS[pair], getattr(geometry, pair), strict=True)
     }
     for name, joint in zip(JOINTS, geometry.joints, strict=True):
         angles = {"home": joint.home_rad, "low": joint.low_rad, "high": joint.high_rad, "stop": joint.stop_rad}
@@ -127,65 +137,3 @@ def text_with_fitted_values(text: str, geometry: Geometry) -> str:
             "]",
         ]
     return "\n".join(lines) + "\n"
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST
-
-
-class _TomlTable:
-    """One table of the file; `require_all_taken` raises FileError if an entry, being unknown, was never taken."""
-
-    def __init__(self, path: Path, where: str, content: dict[str, Any]) -> None:
-        self.path, self.where, self.content = path, where, content
-        self._left = set(content)
-
-    def value(self, name: str, allowed: str, fits: Callable[[Any], bool]) -> Any:
-        if name not in self.content:
-            raise FileError(self.path, f"{self.where}{name} is missing", "every entry of the shipped lego_arm.toml")
-        self._left.discard(name)
-        if not fits(self.content[name]):
-            raise FileError(self.path, f"{self.where}{name} is {shown(self.content[name])}", allowed)
-        return self.content[name]
-
-    def table(self, name: str) -> _TomlTable:
-        content = self.value(name, f"a table [{self.where}{name}]", lambda v: isinstance(v, dict))
-        return _TomlTable(self.path, f"{self.where}{name}.", content)
-
-    def number(self, name: str) -> float:
-        return float(self.value(name, f"a number of magnitude up to {LARGEST:g}", _is_number))
-
-    def require_all_taken(self) -> None:
-        if self._left:
-            name = min(self._left)
-            known = ", ".join(sorted(set(self.content) - self._left))
-            raise FileError(self.path, f"{self.where}{name} is not known", f"the entries {known}")
-
-
-def _built(table: _TomlTable, kind: Callable[..., T], *values: Any) -> T:
-    """Return a value made of a table's entries; a ParameterError becomes a FileError that names the entry."""
-    try:
-        return kind(*values)
-    except ParameterError as error:
-        raise FileError(table.path, f"{table.where}{error.name} is {shown(error.value)}", error.allowed) from error
-
-
-def _parse_joint(table: _TomlTable) -> Joint:
-    port = table.value("port", '"A", "B" or "C"', lambda v: v in ("A", "B", "C"))
-    ratio = table.number("gear_ratio")
-    angles = [math.radians(table.number(f"{name}_deg")) for name in ("home", "low", "high", "play")]
-    stop = math.radians(table.number("stop_deg")) if "stop_deg" in table.content else None
-    return _built(table, Joint, "ABC".index(port), ratio, *angles, stop)
-
-
-def _parse_accuracy(table: _TomlTable) -> Accuracy:
-    whole = "a whole number, 1 or more"
-    marks = table.value("marks", whole, lambda v: isinstance(v, int) and not isinstance(v, bool))
-    sds = [table.number(name) for name in ("place_sd_mm", "height_sd_mm", "scale_sd")]
-    if "covariance" not in table.content:
-        again = "what `arm fit-geometry` writes: fit the marks again (--marks MARKS.csv), or leave [accuracy] out"
-        raise FileError(table.path, "accuracy.covariance is missing", again)
-    allowed, of_numbers = "rows of numbers, [[...], [...], ...]", f"rows of numbers of magnitude up to {LARGEST:g}"
-    table.value("covariance", allowed, lambda v: isinstance(v, list) and all(isinstance(row, list) for row in v))
-    rows = table.value("covariance", of_numbers, lambda v: all(_is_number(number) for row in v for number in row))
-    return _built(table, Accuracy, marks, *sds, tuple(tuple(map(float, row)) for row in rows))

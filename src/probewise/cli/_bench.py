@@ -10,7 +10,6 @@ import queue
 import sys
 import threading
 from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -27,10 +26,12 @@ from probewise.arm import (
     LegoArm,
     OwnInstrument,
     Pose,
+    Reach,
     Reading,
     ReadingScale,
     RequestToPerson,
     SimulatedArm,
+    Workspace,
     read_geometry,
     shipped_geometry_path,
 )
@@ -101,41 +102,47 @@ def open_nxt_arm(port: str, geometry: Geometry, *, start_s: float = 0.0) -> Lego
 
 def open_arm(
     chosen: ArmName,
-    geometry: Geometry,
-    geometry_file: Path | None,
+    geometry: Geometry | None,
+    built: Path | None = None,
+    light: tuple[World, ReadingScale] | None = None,
+    surface: Surface | None = None,
     *,
-    sensor: Path | None = None,
-    scene: str = SCENE,
+    reach: Workspace | None = None,
     seed: int = DEFAULT_SEED,
     start_s: float = 0.0,
     n_taken: int = 0,
+    last: Reading | None = None,
 ) -> Opened:
     """Open an arm; return it with its simulated bench, None for a real arm.
 
-    A user's instrument is connected when it is entered. With a `geometry_file`, the simulated arm has the geometry's
-    reach. A simulated or emulated arm has the sensor of the file `sensor`, the initial target `scene`, and noise of
-    this `seed`, after the `n_taken` readings of an earlier session.
+    A user's instrument is connected when it is entered. An emulated arm is built as its name says, or as the file
+    `built`; a simulated one has this `reach`, and starts at the pose of `last`. Both read with `light`, by default the
+    sensor of the shipped recordings, over `surface`, by default the usual target, with noise of this `seed`, after the
+    `n_taken` readings of an earlier session.
     """
     if chosen.kind == "file":
         return OwnInstrument.from_file(chosen.where, start_s=start_s), None
+    geometry = geometry or read_geometry(shipped_geometry_path())
     if chosen.kind == "nxt":
         return open_nxt_arm(chosen.where, geometry, start_s=start_s), None
-    world, scale = world_and_scale(sensor, lego=chosen.is_lego)
-    table = emulator.Tabletop(emulator.parse_scene(scene))
+    world, scale = light or world_and_scale(None)
+    surface = emulator.parse_scene(SCENE) if surface is None else surface
     if chosen.is_lego:
-        built, seed = chosen.where or geometry_file, seed + n_taken
-        arm, bench = open_emulated_arm_and_bench(geometry, built, world, table.surface, seed=seed, start_s=start_s)
+        setting = (geometry, chosen.where or built, world, surface)
+        arm, bench = open_emulated_arm_and_bench(*setting, seed=seed + n_taken, start_s=start_s)
         return arm, SimulatedBench(bench.table, bench.arm.sensor_pose)
-    number = itertools.count(n_taken)
+    table, number = emulator.Tabletop(surface), itertools.count(n_taken)
 
     def read_world(pose: Pose, time_s: float, height_mm: float) -> float:
         rng = np.random.default_rng([seed, next(number)])
         place = (pose.x_mm, pose.y_mm, pose.orientation_rad)
-        return world.read(table.surface, *place, time_s=time_s, rng=rng, height_mm=height_mm)
+        return table.read(world, *place, time_s=time_s, rng=rng, height_mm=height_mm)
 
-    reach = None if geometry_file is None else geometry
-    make = partial(SimulatedArm, read_world, reach=reach, scale=scale, height_mm=world.height_mm)
-    return make(last=Reading(math.nan, make().pose, start_s)), SimulatedBench(table)
+    reach = reach or Reach()
+    last = last or Reading(math.nan, Pose(*reach.rest_mm), start_s)
+    return SimulatedArm(read_world, reach=reach, scale=scale, height_mm=world.height_mm, last=last), SimulatedBench(
+        table
+    )
 
 
 def open_lego_arm(arguments: argparse.Namespace, geometry: Geometry, *, start_s: float = 0.0) -> LegoArm:
@@ -163,12 +170,14 @@ def open_instrument(
         require(not arguments.dry_run, "--dry-run", True, f"none with {arguments.arm}: it is for the LEGO arm")
         if chosen.kind == "file":
             refuse_options(arguments, arguments.arm, "geometry", "sensor", "scene", "seed")
-        options: dict[str, Any] = {"sensor": None, "scene": scene, "seed": DEFAULT_SEED}
-        given = {name: getattr(arguments, name, None) for name in options}
-        options |= {name: value for name, value in given.items() if value is not None}
-        opened = open_arm(chosen, geometry, arguments.geometry, **options, **taken)
+        sensor, seed = getattr(arguments, "sensor", None), getattr(arguments, "seed", None)
+        surface = emulator.parse_scene(getattr(arguments, "scene", None) or scene)
+        light = None if chosen.kind == "file" else world_and_scale(sensor, lego=chosen.is_lego)
+        seed = DEFAULT_SEED if seed is None else seed
+        reach = None if arguments.geometry is None else geometry
+        opened = open_arm(chosen, geometry, arguments.geometry, light, surface, reach=reach, seed=seed, **taken)
         if opened[1] is not None and arguments.task != "scan":
-            say(arguments, f"seed {options['seed']}")
+            say(arguments, f"seed {seed}")
     if chosen is not None and not arguments.dry_run and not watched:
         confirm_lowering(chosen, opened[0], geometry)
     return opened
@@ -274,29 +283,9 @@ class SimulatedBench:
     ) -> None:
         """Carry out a request of `carry_out`: lay a pattern with its origin at `origin_mm`, or turn the sensor."""
         if request.pattern is not None:
-            self.table.surface = shifted_pattern(patterns[request.pattern], origin_mm)
+            self.table.surface, self.table.origin_mm = patterns[request.pattern], origin_mm
         if request.turned_rad is not None:
             self.table.turned_rad = request.turned_rad
-
-
-def shifted_pattern(pattern: recordings.Pattern, by_mm: tuple[float, float]) -> Surface:
-    """Return a pattern shifted by `by_mm`; raise ParameterError for a ramp, which cannot be shifted."""
-    allowed = "0,0 with a ramp, which is given in field coordinates"
-    require(not isinstance(pattern, recordings.Ramp) or by_mm == (0.0, 0.0), "--origin-mm", by_mm, allowed)
-
-    def moved(place_mm: tuple[float, float]) -> tuple[float, float]:
-        return place_mm[0] + by_mm[0], place_mm[1] + by_mm[1]
-
-    shifted: dict[str, Any] = {}
-    for name, value in vars(pattern).items():
-        if name in ("corner_mm", "center_mm", "origin_mm"):
-            shifted[name] = moved(value)
-        elif name == "vertices_mm":
-            shifted[name] = tuple(map(moved, value))
-        elif name in ("offset_mm", "phase_mm"):  # along the normal
-            normal_rad = vars(pattern)["normal_rad"]
-            shifted[name] = value + (by_mm[0] * math.cos(normal_rad) + by_mm[1] * math.sin(normal_rad))
-    return dataclasses.replace(pattern, **shifted)
 
 
 # Adapting a plan to an arm: unit, range and step of its readings, and the columns that can be commanded

@@ -19,7 +19,7 @@ from probewise import experiment as experiments
 from probewise._arrays import FloatArray
 from probewise._signals import reporting_what_is_kept
 from probewise._writing import Drawings, checked_output_directory
-from probewise.arm import Geometry, Instrument, OwnInstrument, Reading
+from probewise.arm import Geometry, Instrument, Reach, Reading
 from probewise.calibration import FittedSensor, read_sensor
 from probewise.cli import _bench
 from probewise.cli._common import finish, message_to_resume, progress_of, say
@@ -194,24 +194,22 @@ class Search:
         """Open the arm, to continue after the readings `taken`; return it and what a journal says of a true shape."""
         arguments, start_s = self.arguments, taken[-1].time_s if taken else 0.0
         if self.arm.is_real:
-            if self.geometry is None:
-                return OwnInstrument.from_file(self.arm.where, start_s=start_s), {}
-            return _bench.open_nxt_arm(self.arm.where, self.geometry, start_s=start_s), {}
+            return _bench.open_arm(self.arm, self.geometry, start_s=start_s)[0], {}
         hidden = parse_truth(arguments.truth, arguments.shape, self.field, rng=self.streams.truth)
         self.truth_mm = hidden.outline_mm
         self.known = hidden.parameters_by_hypothesis_name(self.experiment.names)
-        world, noise = experiments.world_like(self.sensor), self.streams.noise
-        surface = experiments.with_cards(hidden.surface, self.experiment.cards)
-        arm: Instrument
-        if self.arm.is_lego and self.geometry is not None:
-            seed = noise + len(taken)  # a resumed run draws no noise a second time
-            setting = (self.geometry, self.arm.where or arguments.geometry, world, surface)
-            arm, _ = _bench.open_emulated_arm_and_bench(*setting, seed=seed, start_s=start_s)
-        else:
-            scale = experiments.scale_of(self.sensor.instrumentation)
-            arm = experiments.arm_over(
-                world, surface, self.field, seed=noise, taken=taken, workspace=self.geometry, scale=scale
-            )
+        arm, _ = _bench.open_arm(
+            self.arm,
+            self.geometry,
+            arguments.geometry,
+            (experiments.world_like(self.sensor), experiments.scale_of(self.sensor.instrumentation)),
+            experiments.with_cards(hidden.surface, self.experiment.cards),
+            reach=self.geometry or Reach((self.field.width_mm, self.field.height_mm)),
+            seed=self.streams.noise,
+            start_s=start_s,
+            n_taken=len(taken),
+            last=taken[-1] if taken else None,
+        )
         return arm, {"hidden": hidden.journal_entry}
 
     @property

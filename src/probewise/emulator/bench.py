@@ -173,10 +173,19 @@ _MAKERS: Mapping[str, Callable[..., Surface]] = {
 
 @dataclass
 class Tabletop:
-    """The surface under the sensor, and the sensor's rotation by hand, relative to the geometry's mounting."""
+    """The surface under the sensor, and the sensor's rotation by hand, relative to the geometry's mounting.
+
+    The surface's own origin lies at `origin_mm` of the field.
+    """
 
     surface: Surface
     turned_rad: float = 0.0
+    origin_mm: tuple[float, float] = (0.0, 0.0)
+
+    def read(self, world: World, x_mm: float, y_mm: float, turned_rad: float, **more: Any) -> float:
+        """Read a world's sensor over the surface, at a place of the field; `more` as `World.read` takes it."""
+        x0_mm, y0_mm = self.origin_mm
+        return world.read(self.surface, x_mm - x0_mm, y_mm - y0_mm, turned_rad, **more)
 
     def carry_out_line(self, line: str) -> None:
         """Carry out a typed line: a scene becomes the surface, `turn DEGREES` sets the rotation of the sensor.
@@ -188,7 +197,7 @@ class Tabletop:
             if verb == "turn":
                 self.turned_rad = math.radians(_parse_finite(angle))
             else:
-                self.surface = parse_scene(line.strip())
+                self.surface, self.origin_mm = parse_scene(line.strip()), (0.0, 0.0)
         except ValueError as error:
             raise ParameterError("line", line, f"turn DEGREES; {'; '.join(FORMS)}; in mm and degrees") from error
 
@@ -231,9 +240,8 @@ class LightModel:
             self._number, self._last = self._number + 1, here
             self._rng = np.random.default_rng([self._seed, self._number])
         turned_rad = pose.orientation_rad + self._table.turned_rad
-        bright = self._world.read(
-            self._table.surface, pose.x_mm, pose.y_mm, turned_rad, time_s=self._clock(), rng=self._rng
-        )
+        at = (pose.x_mm, pose.y_mm, turned_rad)
+        bright = self._table.read(self._world, *at, time_s=self._clock(), rng=self._rng)
         # Half is the LED's, as in two rooms: 58 and 32 % over white and black with the LED, 30 and 17 % without.
         led = lit * _led_brightness_at_height(pose.height_mm) / _led_brightness_at_height(self._read_height_mm)
         return (bright + _CUT_OFF) * (1 + led) / 2

@@ -20,7 +20,7 @@ from probewise._arrays import FloatArray, data_frame, read_only_floats, require_
 from probewise._display import ShowsItself
 from probewise._kinds import checked_path
 from probewise._writing import is_device_or_pipe, write_bytes_atomically, write_text_atomically
-from probewise.errors import FileError, ParameterError, ShapeError, require, shortened, shown
+from probewise.errors import FileError, ParameterError, ShapeError, require, shown
 from probewise.progress import Progress, silent
 from probewise.recordings.cells import MISSING, count_numbers
 from probewise.recordings.columns import (
@@ -33,11 +33,20 @@ from probewise.recordings.columns import (
     scan_codes_and_names,
     sessions_of_scans,
 )
-from probewise.recordings.io import image_bytes, is_file_name_without_path, parse_json_file_text, read_image, read_text
+from probewise.recordings.io import (
+    LARGEST,
+    FileObject,
+    image_bytes,
+    is_file_name_without_path,
+    is_number_of_file,
+    parse_json_file_text,
+    read_image,
+    read_text,
+    shortened_json,
+)
 from probewise.recordings.patterns import PATTERNS, Image, Pattern
 from probewise.recordings.plan import Instrumentation, Plan, Recording, range_in_words, require_plan, require_recording
 from probewise.recordings.table import (
-    LARGEST,
     LARGEST_PLACE_MM,
     CSVTable,
     cell_in_words,
@@ -47,6 +56,7 @@ from probewise.recordings.table import (
 )
 
 FORMAT = "recording/1"
+_A_NAME = "a printable text without blanks around it"
 _CONTROLS = ("orientation_deg", "height_mm", "led", "speed")
 
 
@@ -58,38 +68,8 @@ def shortest_degrees(angle_rad: float) -> float:
     return next((c for c in candidates if math.radians(c) == angle_rad), plain)
 
 
-class _Object:
-    """A JSON object of the file, `where` it stands; a FileError names the place of what is wrong in it."""
-
-    def __init__(self, path: Path, where: str, content: object) -> None:
-        if not isinstance(content, dict):
-            raise FileError(path, f"{where} is {_shortened_json(content)}", "an object {...}")
-        self.path, self.where, self.content = path, where, content
-
-    def error(self, name: str, allowed: str) -> FileError:
-        found = f"is {_shortened_json(self.content[name])}" if name in self.content else "is missing"
-        return FileError(self.path, f"{self.where}.{name} {found}".lstrip("."), allowed)
-
-    def value(self, name: str, allowed: str, fits: Callable[[Any], bool]) -> Any:
-        if name not in self.content or not fits(self.content[name]):
-            raise self.error(name, allowed)
-        return self.content[name]
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST
-
-
 def _is_pair(value: object) -> bool:
-    return isinstance(value, list) and len(value) == 2 and all(_is_number(v) for v in value)
-
-
-def _is_text(value: object) -> bool:
-    return isinstance(value, str)
-
-
-def _shortened_json(value: object) -> str:
-    return shortened(json.dumps(value, ensure_ascii=False, default=str), 60)
+    return isinstance(value, list) and len(value) == 2 and all(map(is_number_of_file, value))
 
 
 _KINDS: dict[str, type[Pattern]] = {re.sub("(?<=.)(?=[A-Z])", "_", kind.__name__).lower(): kind for kind in PATTERNS}
@@ -97,7 +77,7 @@ _KIND_OF = {pattern: kind for kind, pattern in _KINDS.items()}
 _A_PICTURE = "the name of a PNG or .npy file in the same folder, without a path"
 # What a field of a pattern may hold in the file, by the field's type.
 _FIELDS: dict[object, tuple[str, Callable[[Any], bool]]] = {
-    "float": ("a finite number", _is_number),
+    "float": ("a finite number", is_number_of_file),
     "tuple[float, float]": ("two finite numbers [x, y]", _is_pair),
     "tuple[int, int]": ("[1, 1], [1, -1], [-1, 1] or [-1, -1]", lambda v: _is_pair(v) and all(abs(d) == 1 for d in v)),
     "tuple[tuple[float, float], ...]": (
@@ -113,62 +93,50 @@ def _name_in_file(field: str) -> str:
     return field.removesuffix("_rad") + "_deg" if field.endswith("_rad") else field
 
 
-def _parse_pattern(found: _Object, kind: type[Pattern]) -> Pattern:
-    values: dict[str, Any] = {}
+def _parse_pattern(found: FileObject) -> tuple[Pattern, list[str]]:
+    """Return a pattern, and notes on entries that its kind does not have."""
+    name = found.value("kind", f"one of {', '.join(_KINDS)}", lambda v: isinstance(v, str) and v in _KINDS)
+    kind: Any = _KINDS[name]
+    values = dict[str, Any]()
     for one in fields(kind):
-        name = _name_in_file(one.name)
-        if one.type not in _FIELDS or (name not in found.content and one.default is not dataclasses.MISSING):
+        entry = _name_in_file(one.name)
+        if one.type not in _FIELDS or (entry not in found.content and one.default is not dataclasses.MISSING):
             continue  # an image's pixels, which are in their own file; what has a default
-        value = found.value(name, *_FIELDS[one.type])
-        values[one.name] = math.radians(value) if name != one.name else value
+        value = found.value(entry, *_FIELDS[one.type])
+        values[one.name] = math.radians(value) if entry != one.name else value
     if kind is Image:
         picture = found.path.parent / values["file"]
         if not picture.is_file():  # the error names the JSON that refers to the picture
             raise found.error("file", "the name of a PNG or .npy file that lies in the same folder")
         values["albedo"] = read_image(picture)
-    try:
-        return kind(**values)
-    except ParameterError as error:
-        raise found.error(error.name, error.allowed) from error
+    unused = ", ".join(found.unknown)
+    return found.build(kind, **values), [f"{unused} not used, no field of kind {name}"] * bool(unused)
 
 
 def read_description(path: Path) -> tuple[Instrumentation, dict[str, Pattern], tuple[str, ...]]:
     """Read NAME.json beside NAME.csv: instrumentation, patterns, notes; FileError for a field missing or invalid."""
     text = read_text(path, f"a description ({FORMAT}) beside the CSV, of the same name with the ending .json")
-    top = _Object(path, "", parse_json_file_text(path, text, "strict JSON, each name once"))
+    top = FileObject(path, "", parse_json_file_text(path, text, "strict JSON, each name once"))
     top.value("format", f'"{FORMAT}"', lambda v: v == FORMAT)
-    patterns: dict[str, Pattern] = {}
-    notes: list[str] = []
-    listed = top.value("patterns", "at least one pattern by name", lambda v: True)
-    for name, content in _Object(path, "patterns", listed).content.items():
+    patterns, notes, listed = dict[str, Pattern](), list[str](), top.object("patterns", "at least one pattern by name")
+    for name in listed.content:
         if name != name.strip() or not name.isprintable():
-            raise FileError(
-                path, f"patterns has a name {_shortened_json(name)}", "a printable text without blanks around it"
-            )
-        found = _Object(path, f"patterns.{name}", content)
-        kind = found.value("kind", f"one of {', '.join(_KINDS)}", lambda v: isinstance(v, str) and v in _KINDS)
-        patterns[name] = _parse_pattern(found, _KINDS[kind])
-        known = (_name_in_file(field.name) for field in fields(_KINDS[kind]) if field.type in _FIELDS)
-        used = {"kind", "inside", "outside", *known}
-        unused = [key for key in content if key not in used]
-        if unused:
-            notes.append(f"pattern {name}: {', '.join(unused)} not used, no field of kind {kind}")
+            raise FileError(path, f"patterns has a name {shortened_json(name)}", _A_NAME)
+        patterns[name], said = _parse_pattern(listed.object(name))
+        notes += [f"pattern {name}: {each}" for each in said]
     if not patterns:
         raise FileError(path, "patterns is empty", "at least one pattern by name")
     instrumentation = _parse_instrumentation(top)
-    notes += [
-        f"controls: {name} is not used, none of {', '.join(_CONTROLS)}"
-        for name in instrumentation.controls
-        if name not in _CONTROLS
-    ]
+    unused = (name for name in instrumentation.controls if name not in _CONTROLS)
+    notes += [f"controls: {name} is not used, none of {', '.join(_CONTROLS)}" for name in unused]
     return instrumentation, patterns, tuple(notes)
 
 
-def _parse_instrumentation(top: _Object) -> Instrumentation:
-    reading, sensor = (_Object(top.path, name, top.content.get(name, {})) for name in ("reading", "sensor"))
-    number, text = ("a finite number", _is_number), ("a text", _is_text)
-    texts = ("a list of texts", lambda v: isinstance(v, list) and all(map(_is_text, v)))
-    places: dict[str, tuple[_Object, str, str, Callable[[Any], bool]]] = {
+def _parse_instrumentation(top: FileObject) -> Instrumentation:
+    reading, sensor = (FileObject(top.path, name, top.content.get(name, {})) for name in ("reading", "sensor"))
+    number, text = _FIELDS["float"], ("a text", lambda v: isinstance(v, str))
+    texts = ("a list of texts", lambda v: isinstance(v, list) and all(isinstance(each, str) for each in v))
+    places: dict[str, tuple[FileObject, str, str, Callable[[Any], bool]]] = {
         "unit": (reading, "unit", *text),
         **{name: (reading, name, *number) for name in ("min", "max", "step")},
         "sensor": (sensor, "name", *text),
@@ -224,7 +192,6 @@ _KNOWN = ("reading", "x_mm", "y_mm", "orientation_deg", "scan", "pattern", "time
 _OF_A_LIGHT_SENSOR = (
     "a header row with it, in a recording by a light sensor; a table of anything else needs --simulator FILE.py"
 )
-_A_NAME = "a printable text without blanks around it"
 _FAR_AWAY = 100.0  # a place this many times the 5 to 95 % range of all places away looks mistyped
 PathLike = str | os.PathLike[str]
 

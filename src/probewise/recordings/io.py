@@ -19,13 +19,15 @@ from collections.abc import Callable, Iterator, Mapping
 from importlib import resources
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise._kinds import checked_path
-from probewise.errors import FileError, ParameterError, PipeWarning, message_of, require, shown
+from probewise.errors import FileError, ParameterError, PipeWarning, message_of, require, shortened, shown
+
+T = TypeVar("T")
 
 
 def read_bytes(path: Path, what: str) -> bytes:
@@ -107,6 +109,75 @@ def parse_strict_json(text: str | bytes) -> Any:
     except RecursionError as error:
         raise ValueError("lists or objects nested too deep") from error
     return value
+
+
+LARGEST = 1e15
+"""Largest magnitude of a number in a file: beyond, squares and differences lose all precision."""
+
+
+class FileObject:
+    """A JSON object or a table of TOML, `where` it stands in its file; a FileError names the place of what is wrong.
+
+    Its numbers are of magnitude up to `largest`.
+    """
+
+    def __init__(self, path: Path, where: str, content: object, *, largest: float = LARGEST) -> None:
+        if not isinstance(content, dict):
+            raise FileError(path, f"{where} is {shortened_json(content)}", "an object {...}, in TOML a table")
+        self.path, self.where, self.largest = path, where, largest
+        self.content: dict[str, Any] = content
+        self._taken = set[str]()
+
+    def error(self, name: str, allowed: str) -> FileError:
+        """Return the error of an entry that is missing or not allowed."""
+        found = f"is {shortened_json(self.content[name])}" if name in self.content else "is missing"
+        return FileError(self.path, f"{self.where}.{name} {found}".lstrip("."), allowed)
+
+    def value(self, name: str, allowed: str, fits: Callable[[Any], bool]) -> Any:
+        """Return an entry that `fits`; FileError if it is missing or does not."""
+        self._taken.add(name)
+        if name not in self.content or not fits(self.content[name]):
+            raise self.error(name, allowed)
+        return self.content[name]
+
+    def number(self, name: str) -> float:
+        """Return an entry that is a number."""
+        allowed = f"a finite number of magnitude up to {self.largest:g}"
+        return float(self.value(name, allowed, lambda value: is_number_of_file(value, self.largest)))
+
+    def object(self, name: str, allowed: str = "an object {...}, in TOML a table") -> FileObject:
+        """Return an entry that is an object."""
+        content = self.value(name, allowed, lambda value: True)
+        return FileObject(self.path, f"{self.where}.{name}".lstrip("."), content, largest=self.largest)
+
+    def build(self, kind: Callable[..., T], *values: Any, **named: Any) -> T:
+        """Return `kind` of values from the object; its ParameterError becomes a FileError that names the entry."""
+        try:
+            return kind(*values, **named)
+        except ParameterError as error:
+            found = f"{self.where}.{error.name} is {shown(error.value)}".lstrip(".")
+            raise FileError(self.path, found, error.allowed) from error
+
+    @property
+    def unknown(self) -> list[str]:
+        """The names of the entries that were not asked for."""
+        return [name for name in self.content if name not in self._taken]
+
+    def require_none_unknown(self) -> None:
+        """Raise FileError if an entry, being unknown, was never asked for."""
+        for name in self.unknown:
+            found = f"{self.where}.{name} is not known".lstrip(".")
+            raise FileError(self.path, found, f"the entries {', '.join(sorted(self._taken))}")
+
+
+def is_number_of_file(value: object, largest: float = LARGEST) -> bool:
+    """Return whether a parsed value is a number of magnitude up to `largest`."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= largest
+
+
+def shortened_json(value: object) -> str:
+    """Return a parsed value as it stands in a file, cut where it is long."""
+    return shortened(json.dumps(value, ensure_ascii=False, default=str), 60)
 
 
 def _dict_of_unique_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

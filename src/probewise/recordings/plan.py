@@ -43,8 +43,9 @@ from probewise.recordings.columns import (
     sessions_of_scans,
     texts_to_numbers,
 )
+from probewise.recordings.io import LARGEST
 from probewise.recordings.patterns import Pattern
-from probewise.recordings.table import LARGEST, LARGEST_PLACE_MM
+from probewise.recordings.table import LARGEST_PLACE_MM
 
 
 @dataclass(frozen=True)

@@ -34,11 +34,9 @@ from probewise.recordings.cells import (
     texts_to_times,
     unit_of_cells,
 )
-from probewise.recordings.io import read_text
+from probewise.recordings.io import LARGEST, read_text
 
-LARGEST = 1e15
-LARGEST_PLACE_MM = 1e9
-"""Largest magnitude of a number in a file: beyond, squares and differences lose all precision."""
+LARGEST_PLACE_MM = 1e9  # places have smaller squares than other numbers, up to `LARGEST`
 
 _BEGIN_FORMULA = ("=", "+", "-", "@")
 _ESCAPED = re.compile(r"'(?='*[=+@-])")  # see _not_as_formula

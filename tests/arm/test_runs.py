@@ -172,17 +172,6 @@ def test_exploring_with_a_brick_goes_on_after_its_line_died(model, bricks, senso
     assert (out / "report.html").exists()
 
 
-def test_what_lies_under_a_real_arm_is_not_given(bricks, sensor_file, tmp_path, capsys):
-    arguments = ["explore", "--sensor", sensor_file, "--out", tmp_path / "x", "--arm", "nxt:x"]
-    status, said = run(capsys, *arguments, "--truth", "500,250,60")
-    assert status == 2
-    assert "--truth is '500,250,60'" in said
-    status, said = run(capsys, *arguments, "--field", "800,400")
-    assert status == 2
-    assert "1048,520, the geometry's" in said
-    assert not bricks["opened"]
-
-
 @pytest.fixture
 def stop_as_it_rises(bricks, monkeypatch):
     """Stop the command as the sensor begins to rise for the n-th time: behind the telegram that turns the motor."""

@@ -1,14 +1,11 @@
 """The verb `arm` and `explore --arm`: tasks at the bench, on no bench."""
 
-import numpy as np
 import pytest
 
-from probewise.arm import shipped_geometry_path
 from probewise.arm.nxt import Brick, Link
 from probewise.cli import main
-from probewise.recordings import Image, Plan, write_plan
 
-TASKS = [["jog", "300,200"], ["home"], ["read"], ["scan", "300,200", "310,200"], ["record", "paper"]]
+TASKS = [["jog", "300,200"], ["home"], ["read"], ["heights"], ["scan", "300,200", "310,200"], ["record", "paper"]]
 
 
 def said(capsys, *arguments, status=0):
@@ -52,44 +49,6 @@ def test_check_tells_of_a_program_that_runs(at_port, capsys):
     assert "the program dance.rxe runs on the brick" in said(capsys, "arm", "check", "--arm", "nxt:x", status=1).err
 
 
-def test_check_of_a_simulated_arm_is_refused_before_anything_is_drawn(tmp_path, capsys):
-    arguments = ["arm", "check", "--arm", "simulated", "--out", tmp_path / "reach.png"]
-    assert "allowed: nxt:PORT" in said(capsys, *arguments, status=2).err
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(
-    ("option", "words"),
-    [
-        ("--out", ["arm", "check", "--geometry"]),
-        ("--drawing", ["arm", "check", "--geometry"]),
-        ("--out", ["arm", "fit-geometry", "--marks", "marks.csv", "--geometry"]),
-        ("--marks", ["arm", "fit-geometry", "--arm", "nxt:none", "--out", "new.toml", "--geometry"]),
-        ("--log", ["emulate-nxt", "--geometry"]),
-        ("--out", ["sheets", "jig", "--geometry"]),
-        ("--log", ["emulate-nxt", "--sensor"]),
-    ],
-)
-def test_a_file_that_is_read_is_not_written(option, words, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    path = tmp_path / "own"
-    path.write_text(shipped_geometry_path().read_text())
-    assert f"{option} is" in said(capsys, *words, path, option, path, status=2).err
-    assert path.read_text() == shipped_geometry_path().read_text()
-
-
-@pytest.mark.parametrize("name", ["p.csv", "p.json", "card.png"])
-@pytest.mark.parametrize("what", ["p.csv", "p.json"])
-def test_no_file_of_a_plan_is_written_as_its_sheets(what, name, tmp_path, capsys):
-    patterns = {"card": Image(np.eye(4), 3.0, (-5.0, -6.0), "card.png")}
-    write_plan(Plan.from_arrays(x_mm=[1.0, 2.0], y_mm=0.0, patterns=patterns, unit="V"), tmp_path / "p.csv")
-    before = (tmp_path / name).read_bytes()
-    assert (
-        "another file than the input" in said(capsys, "sheets", tmp_path / what, "--out", tmp_path / name, status=2).err
-    )
-    assert (tmp_path / name).read_bytes() == before
-
-
 @pytest.mark.parametrize("task", TASKS, ids=lambda task: task[0])
 def test_a_dry_run_prints_the_moves_and_writes_nothing(task, tmp_path, capsys):
     out = ["--out", tmp_path / "r.csv"] if task[0] == "record" else []
@@ -117,31 +76,6 @@ def test_home_here_sets_the_counters_where_a_person_brought_the_arm(capsys):
     assert "set to 0 the counters of base, shoulder, elbow" in out
 
 
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (["jog", "wrist", "5"], "allowed: X,Y in mm; or base, shoulder, elbow, and degrees"),
-        (["jog", "base", "far"], "a number of degrees"),
-        (["jog", "base", "nan"], "WHERE is 'nan'; allowed: a number of degrees"),
-        (["jog", "base", "inf"], "WHERE is 'inf'; allowed: a number of degrees"),
-        (["jog", "300;200"], "X,Y in mm"),
-        (["scan", "300,200", "400,nan"], "X,Y is '400,nan'"),
-        (["jog", "5,5"], "a place on the field"),
-        (["scan", "300,200", "5,5"], "a place on the field"),
-        (["record", "nowhere.csv", "--out", "r.csv"], "nowhere.csv"),
-        (["record", "paper", "--out", "r.csv", "--origin-mm", "5,5"], "move the plan's origin"),
-        (["record", "paper", "--out", "r.csv", "--origin-mm", "middle"], "--origin-mm is 'middle'"),
-    ],
-    ids=lambda value: value if isinstance(value, str) else " ".join(value),
-)
-def test_what_cannot_be_done_is_refused_in_one_line(arguments, says, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    error = said(capsys, "arm", *arguments, "--dry-run", status=2).err
-    assert says in error
-    assert error.count("\n") == 1
-    assert not list(tmp_path.iterdir())
-
-
 @pytest.mark.parametrize("dry", [["--dry-run"], ["--arm", "nxt:x"]], ids=["rehearsed", "on a brick"])
 def test_a_scan_that_leaves_the_reach_moves_nothing_and_prints_nothing(dry, monkeypatch, capsys):
     """The whole scan is checked first: the line to a brick is not even opened."""
@@ -154,27 +88,8 @@ def test_a_scan_that_leaves_the_reach_moves_nothing_and_prints_nothing(dry, monk
     assert "Pose(" not in told.err
 
 
-def test_without_an_arm_there_is_nothing_to_move(capsys):
-    assert "--arm is missing: name the brick" in said(capsys, "arm", "read", status=2).err
-    assert "nxt:PORT" in said(capsys, "arm", "read", "--arm", "simulated", status=2).err
-    assert "that of `probewise emulate-nxt`" in said(capsys, "arm", "read", "--arm", "emulator", status=2).err
-    assert "nxt:PORT" in said(capsys, "arm", "read", "--arm", "ev3:/dev/x", status=2).err
-
-
 def test_a_brick_that_is_not_there_is_told_of_with_status_1(tmp_path, capsys):
     pytest.importorskip("serial", reason="pyserial is not installed")
     error = said(capsys, "arm", "read", "--arm", f"nxt:{tmp_path}/rfcomm0", status=1).err
     assert "cannot be opened" in error
     assert error.count("\n") == 1
-
-
-@pytest.mark.parametrize("name", ["r.csv", "r.json", "card.png"])
-def test_what_a_recording_would_replace_stays(name, tmp_path, capsys):
-    (tmp_path / "plans").mkdir()
-    patterns = {"card": Image(np.eye(4), 3.0, (-5.0, -6.0), "card.png")}
-    write_plan(Plan.from_arrays(x_mm=[1.0, 2.0], y_mm=0.0, patterns=patterns, unit="V"), tmp_path / "plans" / "p.csv")
-    (tmp_path / name).write_text("mine")
-    words = ("arm", "record", tmp_path / "plans" / "p.csv", "--out", tmp_path / "r.csv", "--arm", "nxt:/none")
-    error = said(capsys, *words, status=2).err
-    assert f"{tmp_path / name}: the file exists already; allowed: --resume to continue it" in error
-    assert [path.name for path in tmp_path.iterdir() if path.is_file()] == [name]

@@ -2,7 +2,9 @@
 
 import json
 import struct
+from functools import partial
 
+import command
 import numpy as np
 import pytest
 
@@ -58,19 +60,7 @@ ARRAYS = {
 
 @pytest.fixture
 def refused(tmp_path, capsys):
-    def run(*arguments):
-        """Run, and return the one line of the refusal, which leaves no file but a lock."""
-        before = sorted(tmp_path.rglob("*"))
-        assert main([str(a) for a in arguments]) == 2
-        captured = capsys.readouterr()
-        assert captured.out == ""
-        assert captured.err.count("\n") == 1, captured.err
-        assert captured.err[:-1].isprintable()
-        assert len(captured.err) < 600 + 2 * len(str(tmp_path))
-        assert sorted(path for path in tmp_path.rglob("*") if path.suffix != ".lock") == before
-        return captured.err
-
-    return run
+    return partial(command.refused, capsys, tmp_path)
 
 
 @pytest.mark.parametrize("what", TEXTS)

@@ -61,19 +61,3 @@ def test_a_scan_goes_over_what_lies_there(arm, capsys):
     assert run("arm", "scan", "500,250", "600,250", "--readings", "2", "--arm", arm, "--scene", "600,250,60") == 0
     _, dark, bright = capsys.readouterr().out.splitlines()
     assert float(dark.split(",")[4]) < 20 < 50 < float(bright.split(",")[4])
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--arm", "nxt:x", "--scene", "600,250,80"], "--scene is '600,250,80'; allowed: none with a real arm"),
-        (
-            ["--arm", "simulated", "--dry-run"],
-            "--dry-run is True; allowed: none with simulated: it is for the LEGO arm",
-        ),
-        (["--arm", "emulator", "--scene", "blob"], "--scene is 'blob'; allowed: "),
-    ],
-)
-def test_what_does_not_go_together_is_refused(words, message, capsys):
-    assert run("arm", "scan", "500,250", "600,250", *words) == 2
-    assert message in capsys.readouterr().err

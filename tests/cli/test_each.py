@@ -2,6 +2,7 @@
 
 import csv
 import os
+import sys
 import threading
 
 import numpy as np
@@ -25,7 +26,7 @@ def write_line(path, *, jump=0.0):
     return str(path)
 
 
-def test_each_recording_has_a_row_and_a_folder_and_is_diagnosed_once(tmp_path, monkeypatch, capsys):
+def test_each_recording_has_a_row_and_a_folder_and_is_diagnosed_once(tmp_path, monkeypatch):
     law, out = tmp_path / "line.py", tmp_path / "out"
     law.write_text(LINE)
     (tmp_path / "1.10.csv").write_text("x,z\n1,2\n")
@@ -48,8 +49,6 @@ def test_each_recording_has_a_row_and_a_folder_and_is_diagnosed_once(tmp_path, m
         (out / "a" / "diagnosis.json").write_text(damaged)
         assert main(again) == 0
         assert "a,refused,,,,,again" in (out / "table.csv").read_text().splitlines()
-    assert main(["diagnose", files[0], "--out", str(out), "--workers", "2"]) == 2
-    assert "for --each" in capsys.readouterr().err
 
 
 def test_rows_are_sorted_by_what_ails_most_devices():
@@ -103,3 +102,12 @@ def test_a_recording_that_is_a_pipe_is_waited_for_with_a_word(tmp_path, capsys):
     ]
     assert main(["diagnose", *given, "--quiet"]) == 0
     assert "a.csv is a pipe: reading it waits" in capsys.readouterr().err
+
+
+def test_a_package_that_is_missing_is_named_and_not_the_address(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    assert main(["study", "--out", str(tmp_path / "out"), "--scheduler", "localhost:8786", "--quiet"]) == 1
+    said = capsys.readouterr().err
+    assert "--scheduler needs the package distributed, which is not installed" in said
+    assert "pip install distributed" in said
+    assert said.count("\n") == 1

@@ -11,9 +11,10 @@ import pytest
 
 from probewise.calibration import read_sensor, write_sensor
 from probewise.cli import main, parser
-from probewise.cli.explore import Search
+from probewise.cli.explore import Search, parse_truth
 from probewise.recordings import Instrumentation
 from probewise.report import exploration
+from probewise.scene import Field
 
 
 @pytest.fixture
@@ -103,15 +104,6 @@ def test_the_lego_arms_own_height_may_be_named(sensor_file, tmp_path):
     assert Search(parser().parse_args([str(word) for word in words])).experiment.heights_mm == (14.0,)
 
 
-def test_what_is_found_wrong_when_the_first_place_is_chosen_leaves_nothing_behind(sensor_file, tmp_path, capsys):
-    out = tmp_path / "found"
-    command = ("explore", "--sensor", sensor_file, "--out", out, "--utility", "about:width_mm")
-    assert main([str(word) for word in command]) == 2
-    said = capsys.readouterr().err
-    assert "parameter is 'width_mm'; allowed: one of x_mm, y_mm, radius_mm" in said
-    assert not list(tmp_path.glob("found/*"))
-
-
 @pytest.mark.slow
 def test_what_was_found_is_written_as_a_table_with_its_samples(explore, tmp_path):
     """Of a set of shapes the samples name theirs, and leave the parameters of the others empty."""
@@ -189,6 +181,10 @@ def test_without_a_sensor_a_simulated_run_takes_that_of_the_recording_that_ships
     assert main([*given, "3", "--resume"]) == 0
     assert "going through the journal, 0 of 2" in capsys.readouterr().err.splitlines()[0]
     assert json.loads((out / "result.json").read_text())["readings"] == 3
-    assert main(["explore", "--out", str(tmp_path / "other"), "--arm", "nxt:none"]) == 2
-    assert "--sensor is 'none'" in capsys.readouterr().err
-    assert not (tmp_path / "other").exists()
+
+
+@pytest.mark.parametrize("truth", ["0,0,20", "1048,520,150", "ellipse:500,250,90,90,0", "hexagon:500,250,30,0"])
+def test_a_truth_on_its_bounds_is_taken(truth):
+    hidden = parse_truth(truth, ["circle"], Field(), rng=np.random.default_rng(0))
+    assert hidden.name == (truth.partition(":")[0] if ":" in truth else "circle")
+    assert hidden.theta.tolist() == [float(cell) for cell in truth.rpartition(":")[2].split(",")]

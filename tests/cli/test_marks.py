@@ -80,17 +80,6 @@ def test_an_arm_that_is_known_less_well_than_a_shape_is_to_be_says_so_before_it_
     assert capsys.readouterr().err == ""
 
 
-def test_fitting_needs_an_arm_or_marks_and_keeps_what_stands_there(tmp_path, capsys):
-    out = str(tmp_path / "a.toml")
-    assert main(["arm", "fit-geometry", "--out", out]) == 2
-    assert "--arm is missing" in capsys.readouterr().err
-    assert main(["arm", "fit-geometry", "--out", out, "--arm", "simulated"]) == 2
-    assert "nxt:PORT or emulator:TRUE.toml" in capsys.readouterr().err
-    (tmp_path / "a.marks.csv").write_text("")
-    assert main(["arm", "fit-geometry", "--out", out, "--arm", "emulator"]) == 2
-    assert "--resume to continue it" in capsys.readouterr().err
-
-
 def test_a_person_moves_the_sensor_in_words_and_is_told_what_cannot_be_done():
     geometry = read_geometry(shipped_geometry_path())
     arm = LegoArm(DryRun(geometry, lambda text: None), geometry)

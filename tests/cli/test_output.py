@@ -140,31 +140,6 @@ def test_an_input_that_would_be_replaced_is_set_aside_with_its_description(tmp_p
     }
 
 
-@pytest.mark.parametrize(
-    ("held", "words"),
-    [
-        ("diagnosis.json", "fit data.csv --simulator heater.py"),
-        ("fit.json", "diagnose data.csv --simulator heater.py"),
-        ("fit.json", "investigate --plan paper"),
-        ("diagnosis.json", "calibrate data.csv"),
-        ("diagnosis.json", "audit data.csv"),
-        ("trials.jsonl", "study --concealed"),
-        ("cases.jsonl", "study"),
-        ("counts.svg", "challenge"),
-        ("answers.json", "calibrate data.csv"),
-        *(("fit.json", words) for words in ("explore", "demo", "study", "challenge", "diagnose data.csv --each")),
-        ("result.json", "fit data.csv --simulator heater.py"),
-    ],
-)
-def test_results_of_two_verbs_do_not_mix_in_one_folder(held, words, tmp_path, capsys):
-    (tmp_path / held).write_text("{}")
-    assert main([*words.split(), "--out", str(tmp_path)]) == 2
-    said = capsys.readouterr().err
-    assert f"--out is '{tmp_path}'; allowed: another folder: this one holds " in said
-    assert f" ({held}), with which these results would mix" in said
-    assert [path.name for path in tmp_path.iterdir()] == [held]
-
-
 def test_results_that_replace_those_of_an_earlier_run_say_so(tmp_path):
     said, stages = [], []
     for other in ("b.json", "c.json"):
@@ -179,22 +154,6 @@ def test_results_that_replace_those_of_an_earlier_run_say_so(tmp_path):
         said.append(drawings.notes)
     assert said == [[], ["note: the results of an earlier run there were replaced"]]
     assert stages[0] == ("writing the results",)
-
-
-@pytest.mark.parametrize("verb", ["diagnose", "calibrate"])
-def test_an_empty_name_is_not_the_directory_one_is_in(verb, recording_file, capsys):
-    assert main([verb, str(recording_file), "--out", ""]) == 2
-    assert "names no file or directory" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("verb", ["diagnose", "audit"])
-def test_a_sensor_that_reads_in_another_unit_is_refused(verb, sensor_file, recording_file, tmp_path, capsys):
-    text = recording_file.with_suffix(".json").read_text()
-    recording_file.with_suffix(".json").write_text(text.replace('"LEGO"', '"mW"'))
-    out = tmp_path / "out"
-    assert main([verb, str(recording_file), "--sensor", str(sensor_file), "--out", str(out)]) == 2
-    assert "'LEGO'" in capsys.readouterr().err
-    assert not out.exists()
 
 
 def test_a_search_does_not_replace_the_sensor_that_it_was_given(sensor_file, tmp_path, quick_frames, capsys):

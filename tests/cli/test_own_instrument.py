@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import re
 
 import numpy as np
 import pytest
@@ -148,22 +147,6 @@ def test_a_scan_shows_where_readings_were_taken_and_what_they_bring(arm_file, ca
     assert header == ["x_mm", "y_mm", "orientation_deg", "time_s", "reading", "temperature_c"]
     assert [row[:3] for row in rows] == [["-49.750", "259.500", "90.000"], ["600.250", "-100.500", "90.000"]]
     assert [row[4:] for row in rows] == [["140", "21"], ["140", "22"]]
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["home"], "--arm is .*allowed: nxt:PORT; FILE.py is for `arm scan`, `arm record` and `explore`"),
-        (["scan", "0,0", "1,1", "--dry-run"], "--dry-run is True; allowed: none with .*my_arm.py: it is for"),
-        (["scan", "0,0", "1,1", "--geometry", "a.toml"], "a.toml"),
-        (["record", "paper", "--out", "r.csv", "--range", "5"], "--range is '5'; allowed: LOW,HIGH"),
-        (["record", "paper", "--out", "r.csv", "--unit", "V", "--range", "5,1"], "max is 1.0; allowed: greater than"),
-    ],
-)
-def test_tasks_of_the_bench_that_need_the_lego_arm_say_so(words, message, arm_file, capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert run("arm", *words, "--arm", arm_file()) == 2
-    assert re.search(message, capsys.readouterr().err)
 
 
 @pytest.mark.slow

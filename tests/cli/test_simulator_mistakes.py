@@ -3,6 +3,7 @@
 import sys
 from pathlib import Path
 
+import command
 import numpy as np
 import pytest
 from heater import FILE, runs
@@ -11,18 +12,11 @@ from probewise.cli import main
 from probewise.systems import System, read_simulator, run_table_csv
 
 
-def refused(capsys, tmp_path, file, *arguments, table=None, more=()):
+def refused(capsys, tmp_path, file, *, table=None, more=()):
     (tmp_path / "heater.py").write_text(file)
-    data = tmp_path / "data.csv"
-    data.write_text(table if table is not None else run_table_csv(runs()))
-    out = tmp_path / "out"
-    simulator = str(tmp_path / "heater.py")
-    assert main(["diagnose", str(data), *more, "--simulator", simulator, "--out", str(out), *arguments]) == 2
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert captured.err.count("\n") == 1, captured.err
-    assert not out.exists()
-    return captured.err
+    (tmp_path / "data.csv").write_text(table if table is not None else run_table_csv(runs()))
+    words = ("diagnose", tmp_path / "data.csv", *more, "--simulator", tmp_path / "heater.py")
+    return command.refused(capsys, tmp_path, *words, "--out", tmp_path / "out")
 
 
 def law_whose_rates(do):
@@ -182,16 +176,6 @@ def test_a_mistake_in_a_law_is_one_line(capsys, tmp_path, law, said):
     assert said in refused(capsys, tmp_path, law, table=table)
 
 
-def test_a_sensor_beside_a_simulator_is_refused(capsys, tmp_path):
-    assert "--sensor is 's.json'; allowed: none with --simulator" in refused(
-        capsys, tmp_path, FILE, "--sensor", "s.json"
-    )
-
-
-def test_a_table_given_twice_is_refused(capsys, tmp_path):
-    assert "these hold the same rows" in refused(capsys, tmp_path, FILE, more=(str(tmp_path / "data.csv"),))
-
-
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -206,11 +190,6 @@ def test_a_table_given_twice_is_refused(capsys, tmp_path):
 def test_a_mistake_in_a_further_table_is_told_with_its_file_and_row(capsys, tmp_path, text, said):
     (tmp_path / "more.csv").write_text(text)
     assert said in refused(capsys, tmp_path, FILE, more=(str(tmp_path / "more.csv"),))
-
-
-def test_a_journal_is_refused(capsys, tmp_path):
-    (tmp_path / "journal.jsonl").write_text("{}\n")
-    assert "a journal; allowed: a CSV table" in refused(capsys, tmp_path, FILE, more=(str(tmp_path / "journal.jsonl"),))
 
 
 def test_a_row_in_which_an_input_is_missing_is_left_out_and_noted():

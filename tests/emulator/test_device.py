@@ -8,8 +8,6 @@ import time
 
 import pytest
 
-from probewise.cli import main
-
 pytestmark = pytest.mark.skipif(not hasattr(os, "openpty"), reason="this system has no pseudo-terminals")
 
 LIMIT_S = 60.0
@@ -94,31 +92,3 @@ def _is_there(file):
         return not ready or bool(os.read(file, 1))
     except OSError:
         return False
-
-
-def test_a_link_never_replaces_a_file(tmp_path, capsys):
-    precious = tmp_path / "precious"
-    precious.write_text("keep me", encoding="utf-8")
-    assert main(["emulate-nxt", "--link", str(precious)]) == 2
-    assert precious.read_text(encoding="utf-8") == "keep me"
-    assert str(precious) in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("options", "found"),
-    [
-        (["--fault", "gremlins"], "--fault"),
-        (["--scene", "1,2"], "--scene"),
-        (["--scene", "blob:1,2,3"], "--scene"),
-        (["--sleep", "7"], "sleep_min"),
-        (["--geometry", "nowhere.toml"], "nowhere.toml"),
-        (["--sensor", "nowhere.json"], "nowhere.json"),
-        (["--seed", "-1"], "--seed"),
-    ],
-)
-def test_a_wrong_command_line_is_told_in_one_line(options, found, capsys):
-    assert main(["emulate-nxt", *options]) == 2
-    said = capsys.readouterr()
-    assert said.out == ""
-    assert found in said.err
-    assert said.err.count("\n") == 1

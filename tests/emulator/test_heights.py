@@ -55,12 +55,3 @@ def test_an_arm_that_is_as_its_file_says_is_not_contradicted(capsys):
     # The LED's half goes with h exp(-h / 8 mm), the room's half with nothing.
     fall = (1 / 8 - 1 / 14) / 2
     assert float(re.search(r"light_per_mm = ([\d.]+)", said.out)[1]) == pytest.approx(fall, rel=0.2)
-
-
-def test_one_place_is_too_few_and_another_arm_has_no_light_to_ask(capsys):
-    assert main(["arm", "heights", "524,260", "--arm", "emulator"]) == 2
-    assert "two places or more" in capsys.readouterr().err
-    assert main(["arm", "heights", "--arm", "simulated"]) == 2
-    assert "nxt:PORT" in capsys.readouterr().err
-    assert main(["arm", "heights", "--dry-run"]) == 0
-    assert "motor from" in capsys.readouterr().out

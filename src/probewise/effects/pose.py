@@ -26,7 +26,13 @@ from probewise.effects.effect import (
     sine_and_cosine_entries,
     single_column_bank,
 )
-from probewise.effects.reference import Extent, candidate_scan_groups, distinct_positions_mm, scan_indicator
+from probewise.effects.reference import (
+    Extent,
+    candidate_scan_groups,
+    distinct_positions_mm,
+    scan_indicator,
+    sign_of_change,
+)
 from probewise.priors import LogUniform, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.commanded import height_ratio
@@ -70,21 +76,12 @@ def backlash(kind: LightEffect, of: Extent) -> Effect:
 @light_effect("backlash", Stage.POSE, "backlash (play) of each axis", ("slope", "direction"))
 def play_of_axes(kind: LightEffect, of: Extent) -> Effect:
     """Play in the gears of each axis: position = commanded - (width_mm / 2) s, s the side it last moved to."""
-    act = acting(lambda value, plan, width: _moved(value, *(-(width / 2) * side for side in _side_of_each_axis(plan))))
+
+    def act(value: Poses, theta: FloatArray, plan: Plan) -> Poses:
+        sides = sign_of_change(np.stack([plan.x_mm, plan.y_mm]), plan.rows_by_scan(), still=_STILL_MM)
+        return _moved(value, *(-(theta[:, :1] / 2) * side for side in sides))
+
     return replace(cast(Effect, backlash.build(kind, of)), apply=act, form="of each axis")
-
-
-def _side_of_each_axis(plan: Plan) -> FloatArray:
-    """Return the sign of each axis' last motion within the scan, (2, n_points); before the first, that of the first."""
-    sides = np.zeros((2, len(plan)))
-    for rows in plan.rows_by_scan():
-        for side, place in zip(sides, (plan.x_mm[rows], plan.y_mm[rows]), strict=True):
-            signs = np.sign(np.where(np.abs(np.diff(place)) > _STILL_MM, np.diff(place), 0.0))
-            moved = np.flatnonzero(signs)
-            if moved.size:
-                last = np.searchsorted(moved, np.arange(-1, len(signs)), side="right") - 1
-                side[rows] = signs[moved[np.maximum(last, 0)]]
-    return sides
 
 
 @light_effect("position_scale", Stage.POSE, "a wrong scale of the positions", ("place", "slope"), counts="place")

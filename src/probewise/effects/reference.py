@@ -8,8 +8,9 @@ from functools import cached_property, lru_cache
 from typing import Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from probewise._arrays import FloatArray, distinct_values, rounding_error
+from probewise._arrays import FloatArray, IntArray, distinct_values, rounding_error
 from probewise.errors import require
 from probewise.recordings.plan import Plan, Recording
 
@@ -189,6 +190,24 @@ def sign_of_motion(plan: Plan) -> FloatArray:
     """Return the sign of each reading's last motion, (n_points,): along X, or Y where X stays; 0 without motion."""
     along_x, along_y = np.sign(plan.direction_of_motion).T
     return np.asarray(np.where(along_x != 0, along_x, along_y))
+
+
+def sign_of_change(values: FloatArray, by_scan: Iterable[IntArray], still: ArrayLike) -> FloatArray:
+    """Return the sign of the change of values from the previous row of the scan, (n_samples, n_points) both.
+
+    Where they change by at most `still`, the sign of the last change holds; before a scan's first, the sign of that.
+    """
+    out = np.zeros_like(values)
+    for rows in by_scan:
+        if len(rows) < 2:
+            continue
+        changes = np.diff(values[:, rows], axis=1)
+        signs = np.where(np.abs(changes) > still, np.sign(changes), 0.0)
+        last = np.maximum.accumulate(np.where(signs != 0, np.arange(signs.shape[1]), -1), axis=1)
+        last = np.where(last < 0, np.argmax(signs != 0, axis=1)[:, None], last)
+        out[:, rows[1:]] = np.take_along_axis(signs, last, axis=1)
+        out[:, rows[0]] = out[:, rows[1]]
+    return out
 
 
 def scan_indicator(plan: Plan, names: tuple[str, ...]) -> FloatArray:

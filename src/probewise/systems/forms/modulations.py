@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -158,13 +158,11 @@ def _weighted_residuals(about: ReferenceFit) -> FloatArray:
 class Modulation:
     """Variation of a quantity over the rows: `at_rows(theta, table)`, (n_samples, n_points), is 0 at amplitude 0.
 
-    `declared` is what `ReferenceFit.form` takes of it: parameters, covariates, words and more; `variant` the same of
-    another variant, if there is one.
+    `variants` are what `ReferenceFit.form` takes of each: parameters, covariates, words and more.
     """
 
     at_rows: Callable[[FloatArray, RunTable], FloatArray]
-    declared: dict[str, Any]
-    variant: dict[str, Any] | None = None
+    variants: Sequence[dict[str, Any]]
 
 
 def time_since_start_of_run(table: RunTable) -> FloatArray:
@@ -192,18 +190,18 @@ def linear_drift_modulation(about: ReferenceFit, what: str, unit: str) -> Modula
             along = np.where(theta[:, 1:] > 0.5, time_since_start_of_run(rows), along)
         return np.asarray(theta[:, :1] * along)
 
-    variants = list[dict[str, Any]]()
-    for in_each_run in (False, True) if follow_each_other else ():
-        value, of_flag = flag(in_each_run)
-        variants.append({"parameters": {_IN_EACH_RUN: (of_flag, "1")}, "entries": np.array([[[1.0, value]]])})
     size: dict[str, Any] = {"a": (AMPLITUDE, f"{unit or '1'}/{per}")}
-    declared = {
-        "covariates": ("time",),
-        "says": says,
-        "counted_from": origin_in_words(table.time, origin, per),
-    }
-    given = [declared | each | {"parameters": size | each["parameters"]} for each in variants]
-    return Modulation(at_rows, *(given or [declared | {"parameters": size}]))
+    declared = {"covariates": ("time",), "says": says, "counted_from": origin_in_words(table.time, origin, per)}
+    if not follow_each_other:
+        return Modulation(at_rows, [{"parameters": size, **declared}])
+    flags = [flag(in_each_run) for in_each_run in (False, True)]
+    return Modulation(
+        at_rows,
+        [
+            {"parameters": {**size, _IN_EACH_RUN: (prior, "1")}, "entries": np.array([[[1.0, value]]]), **declared}
+            for value, prior in flags
+        ],
+    )
 
 
 def column_proportional_modulation(about: ReferenceFit, what: str, unit: str, name: str) -> Modulation:
@@ -214,7 +212,7 @@ def column_proportional_modulation(about: ReferenceFit, what: str, unit: str, na
         "covariates": (covariate_of_column(name),),
         "says": lambda mean, sd: f"{what} changes by {value_with_sd(mean[0], sd[0], unit)} per {per} of {name}",
     }
-    return Modulation(lambda theta, rows: theta[:, :1] * (rows.covariates[name] - middle), declared)
+    return Modulation(lambda theta, rows: theta[:, :1] * (rows.covariates[name] - middle), [declared])
 
 
 def change_point_step_modulation(about: ReferenceFit, what: str, unit: str, *, may_end: bool = False) -> Modulation:
@@ -250,7 +248,7 @@ def change_point_step_modulation(about: ReferenceFit, what: str, unit: str, *, m
         declared |= {"parameters": size | until | begin, "entries": entries, "never": never}
     else:
         declared |= {"parameters": size | begin, "entries": np.array([[[1.0, middle]]])}
-    return Modulation(at_rows, {**declared, "kind": StepEffect})
+    return Modulation(at_rows, [{**declared, "kind": StepEffect}])
 
 
 def value_per_run_modulation(about: ReferenceFit, what: str, unit: str) -> Modulation:
@@ -269,7 +267,7 @@ def value_per_run_modulation(about: ReferenceFit, what: str, unit: str) -> Modul
         return f"{what} differs from run to run, most in run {names[far]}: by {by}"
 
     parameters = {f"values[{name}]": (AMPLITUDE, unit) for name in names}
-    return Modulation(at_rows, {"parameters": parameters, "covariates": ("run",), "says": says})
+    return Modulation(at_rows, [{"parameters": parameters, "covariates": ("run",), "says": says}])
 
 
 def modulations_over_rows(about: ReferenceFit) -> dict[str, Callable[..., Modulation]]:
@@ -308,7 +306,7 @@ def sinusoid_modulation(about: ReferenceFit, what: str, unit: str) -> Modulation
         return f"{what} oscillates with an amplitude of {size} and a period of {period}"
 
     own = {"says": says, "suggested": suggested, **declared_wave(about, frequencies, unit, highest)}
-    return Modulation(at_rows, own)
+    return Modulation(at_rows, [own])
 
 
 def modulated_form(
@@ -319,14 +317,10 @@ def modulated_form(
     Several values have one scale in common, unless they are so many that a single one could not differ much more than
     the others within the bounds of a coordinate.
     """
-    forms = [
-        form
-        for given in (how.declared, how.variant)
-        if given is not None
-        for form in about.form(
-            name, stage, act=act, guess=guess, **given | {"covariates": given["covariates"] + covariates}
-        )
-    ]
+    forms = list[Effect]()
+    for variant in how.variants:
+        given = variant | {"covariates": variant["covariates"] + covariates}
+        forms += about.form(name, stage, act=act, guess=guess, **given)
     if len(forms) == 1 and 1 < len(forms[0].amplitudes) <= _MOST_OF_ONE_SCALE:
         # All runs may differ about as much, or one of them alone by far more than the others.
         names = forms[0].prior.names

@@ -25,6 +25,7 @@ from probewise.effects.effect import (
     sizes_inside,
 )
 from probewise.effects.reading import decaying_sum
+from probewise.effects.reference import sign_of_change
 from probewise.priors import HeavyTailedPrior, LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.modulations import (
@@ -288,33 +289,15 @@ def _settling_form(about: ReferenceFit) -> Iterator[Effect]:
     yield from about.form("settling", Stage.OFFSET, *own, guess=1.0)
 
 
-def sign_of_change(values: FloatArray, table: RunTable) -> FloatArray:
-    """Return the sign of the change from the previous row of the run, (n_samples, n_points).
-
-    Where values do not change, the sign of the last change holds; before a run's first change, the sign of that one.
-    """
-    out, still = np.zeros_like(values), rounding_error(values, axis=1)
-    for rows in table.rows_by_scan():
-        if len(rows) < 2:
-            continue
-        changes = np.diff(values[:, rows], axis=1)
-        signs = np.where(np.abs(changes) > still, np.sign(changes), 0.0)
-        number = np.where(signs != 0, np.arange(signs.shape[1]), -1)
-        last = np.maximum.accumulate(number, axis=1)
-        first = np.argmax(signs != 0, axis=1)
-        last = np.where(last < 0, first[:, None], last)
-        own = np.take_along_axis(signs, last, axis=1)
-        out[:, rows[1:]] = own
-        out[:, rows[0]] = own[:, 0]
-    return out
-
-
 def _hysteresis_form(about: ReferenceFit) -> Iterator[Effect]:
-    if np.ptp(sign_of_change(about.predicted[None, :], about.table)) == 0:
+    def side(values: FloatArray, rows: RunTable) -> FloatArray:
+        return sign_of_change(values, rows.rows_by_scan(), still=rounding_error(values, axis=1))
+
+    if np.ptp(side(about.predicted[None, :], about.table)) == 0:
         return
     own, way = about.system.simulator, "{more/less} while it rises than while it falls"
     says = in_words(f"{own.reading} reads {{|0|}} {way}", own.unit, factors=(2,))
-    act = acting(lambda value, rows, a: value + a * sign_of_change(value, rows))
+    act = acting(lambda value, rows, a: value + a * side(value, rows))
     size: Declared = {"a": (AMPLITUDE, own.unit)}
     yield from about.form("hysteresis", Stage.HYSTERESIS, size, ("previous",), act, says, typical=about.sd)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -16,14 +16,16 @@ from probewise.effects.effect import (
     MOST_FREQUENCIES,
     PHASE,
     POSITIVE,
-    Act,
     ChangePoints,
+    Declared,
     Effect,
     Fixed,
+    Say,
     StepEffect,
     WaveEffect,
     in_words,
     sine_and_cosine_entries,
+    single_column_bank,
 )
 from probewise.effects.reference import is_far_from_zero
 from probewise.priors import LogUniform, SharedScalePrior, Uniform
@@ -155,14 +157,38 @@ def _weighted_residuals(about: ReferenceFit) -> FloatArray:
 
 
 @dataclass(frozen=True, eq=False)
-class Modulation:
-    """Variation of a quantity over the rows: `at_rows(theta, table)`, (n_samples, n_points), is 0 at amplitude 0.
+class Quantity:
+    """What may vary over the rows, in words, with its unit; `add` returns a stage's value with the variation added.
 
-    `variants` are what `ReferenceFit.form` takes of each: parameters, covariates, words and more.
+    `guess` is an amplitude so small that the readings change in proportion; `covariates` are those along which the
+    residual shows whatever the variation.
     """
 
-    at_rows: Callable[[FloatArray, RunTable], FloatArray]
-    variants: Sequence[dict[str, Any]]
+    what: str
+    unit: str
+    stage: Stage
+    guess: float
+    add: Callable[[Any, FloatArray], Any]
+    covariates: tuple[str, ...] = ()
+
+    def varying(
+        self,
+        about: ReferenceFit,
+        name: str,
+        at_rows: Callable[[FloatArray, RunTable], FloatArray],
+        parameters: Declared,
+        covariates: tuple[str, ...],
+        says: Say,
+        entries: FloatArray | None = None,
+        **more: Any,
+    ) -> Iterator[Effect]:
+        """Yield the form by which it varies as `at_rows(theta, table)`, (n_samples, n_points), 0 at amplitude 0."""
+
+        def act(value: Any, theta: FloatArray, rows: RunTable) -> Any:
+            return self.add(value, at_rows(theta, rows))
+
+        own = (name, self.stage, parameters, covariates + self.covariates, act, says, entries)
+        return about.form(*own, guess=self.guess, **more)
 
 
 def time_since_start_of_run(table: RunTable) -> FloatArray:
@@ -171,8 +197,8 @@ def time_since_start_of_run(table: RunTable) -> FloatArray:
     return np.asarray(table.time_s - first[table.scan])
 
 
-def linear_drift_modulation(about: ReferenceFit, what: str, unit: str) -> Modulation:
-    """Return a linear drift a t, with recorded time t from its origin: 0, or the first time if far from 0.
+def drift_form(about: ReferenceFit, name: str, of: Quantity) -> Iterator[Effect]:
+    """Yield a linear drift a t, with recorded time t from its origin: 0, or the first time if far from 0.
 
     Of runs one after the other, another variant counts the time from the start of each run.
     """
@@ -182,7 +208,7 @@ def linear_drift_modulation(about: ReferenceFit, what: str, unit: str) -> Modula
 
     def says(mean: FloatArray, sd: FloatArray) -> str:
         anew = " in each run, from its start" if (mean[1:] > 0.5).any() else ""
-        return f"{what} drifts by {value_with_sd(mean[0], sd[0], unit)} per {per}{anew}"
+        return f"{of.what} drifts by {value_with_sd(mean[0], sd[0], of.unit)} per {per}{anew}"
 
     def at_rows(theta: FloatArray, rows: RunTable) -> FloatArray:
         along = rows.time_s - origin
@@ -190,41 +216,40 @@ def linear_drift_modulation(about: ReferenceFit, what: str, unit: str) -> Modula
             along = np.where(theta[:, 1:] > 0.5, time_since_start_of_run(rows), along)
         return np.asarray(theta[:, :1] * along)
 
-    size: dict[str, Any] = {"a": (AMPLITUDE, f"{unit or '1'}/{per}")}
-    declared = {"covariates": ("time",), "says": says, "counted_from": origin_in_words(table.time, origin, per)}
+    size: Declared = {"a": (AMPLITUDE, f"{of.unit or '1'}/{per}")}
+    more, variants = {"counted_from": origin_in_words(table.time, origin, per)}, list[Effect]()
     if not follow_each_other:
-        return Modulation(at_rows, [{"parameters": size, **declared}])
-    flags = [flag(in_each_run) for in_each_run in (False, True)]
-    return Modulation(
-        at_rows,
-        [
-            {"parameters": {**size, _IN_EACH_RUN: (prior, "1")}, "entries": np.array([[[1.0, value]]]), **declared}
-            for value, prior in flags
-        ],
+        variants += of.varying(about, name, at_rows, size, ("time",), says, **more)
+    for value, prior in map(flag, (False, True)) if follow_each_other else ():
+        both, bank = {**size, _IN_EACH_RUN: (prior, "1")}, single_column_bank(1.0, value)
+        variants += of.varying(about, name, at_rows, both, ("time",), says, bank, **more)
+    if variants:
+        yield replace(variants[0], alternatives=tuple(variants[1:]))
+
+
+def form_along_column(about: ReferenceFit, name: str, of: Quantity, column: str) -> Iterator[Effect]:
+    """Yield a variation in proportion to a column, about its mean over the recording: a (C - mean C)."""
+    middle, per = float(np.nanmean(about.table.covariates[column])), unit_of_name(column) or "unit"
+    return of.varying(
+        about,
+        name,
+        lambda theta, rows: theta[:, :1] * (rows.covariates[column] - middle),
+        {"a": (AMPLITUDE, f"{of.unit or '1'} per {column}")},
+        (covariate_of_column(column),),
+        lambda mean, sd: f"{of.what} changes by {value_with_sd(mean[0], sd[0], of.unit)} per {per} of {column}",
     )
 
 
-def column_proportional_modulation(about: ReferenceFit, what: str, unit: str, name: str) -> Modulation:
-    """Return a variation in proportion to a column, about its mean over the recording: a (C - mean C)."""
-    middle, per = float(np.nanmean(about.table.covariates[name])), unit_of_name(name) or "unit"
-    declared = {
-        "parameters": {"a": (AMPLITUDE, f"{unit or '1'} per {name}")},
-        "covariates": (covariate_of_column(name),),
-        "says": lambda mean, sd: f"{what} changes by {value_with_sd(mean[0], sd[0], unit)} per {per} of {name}",
-    }
-    return Modulation(lambda theta, rows: theta[:, :1] * (rows.covariates[name] - middle), [declared])
-
-
-def change_point_step_modulation(about: ReferenceFit, what: str, unit: str, *, may_end: bool = False) -> Modulation:
-    """Return a step at a change point: a 1(t > t0), in time if recorded, else in row number; it may go back."""
+def step_form(about: ReferenceFit, name: str, of: Quantity, *, may_end: bool = False) -> Iterator[Effect]:
+    """Yield a step at a change point: a 1(t > t0), in time if recorded, else in row number; it may go back."""
     table, by_row = about.table, not about.table.has_varying_time
     along = np.arange(float(len(table))) if by_row else table.time_s
     ends = sorted((along[rows].max(), along[rows].min()) for rows in table.rows_by_scan())
-    change_points = ChangePoints.of(along, by_row=by_row)
-    if len(ends) == 2 and ends[0][0] < ends[1][1] and len(change_points.at) > 5:
-        change_points = replace(change_points, border=float(ends[0][0]))
-    first, last = change_points.at[0], change_points.at[-1]
-    place, of_place = ("row", "row") if by_row else ("s", about.time_unit)
+    points = ChangePoints.of(along, by_row=by_row)
+    if len(ends) == 2 and ends[0][0] < ends[1][1] and len(points.at) > 5:
+        points = replace(points, border=float(ends[0][0]))
+    first, last = points.at[0], points.at[-1]
+    place, unit = ("row", "row") if by_row else ("s", about.time_unit)
 
     def at_in_words(mean: float, sd: float) -> str:  # of rows, a point between two, counted from 0
         row = f"row {int(mean) + 3} of the table (the header is row 1)"
@@ -233,26 +258,27 @@ def change_point_step_modulation(about: ReferenceFit, what: str, unit: str, *, m
     def says(mean: FloatArray, sd: FloatArray) -> str:
         goes_back = may_end and mean[1] > mean[2]
         then = f"goes back at {at_in_words(mean[1], sd[1])}" if goes_back else "stays there"
-        size = value_with_sd(mean[0], sd[0], unit)
-        return f"{what} jumps by {size} at {at_in_words(mean[-1], sd[-1])} and {then}"
+        size = value_with_sd(mean[0], sd[0], of.unit)
+        return f"{of.what} jumps by {size} at {at_in_words(mean[-1], sd[-1])} and {then}"
 
     def at_rows(theta: FloatArray, rows: RunTable) -> FloatArray:
-        at, begin, end = change_points.variable_at_rows(rows), theta[:, -1:], theta[:, 1:2]
+        at, begin, end = points.variable_at_rows(rows), theta[:, -1:], theta[:, 1:2]
         return np.asarray(theta[:, :1] * ((at > begin) & ((at <= end) | (end <= begin))))
 
-    size, begin = {"a": (AMPLITUDE, unit)}, {f"at_{place}": (Uniform(first, last), of_place)}
-    never, middle = Fixed(first - 2.0, first - 1.0), 0.5 * (first + last)
-    declared = {"covariates": ("row",) if by_row else ("time",), "says": says, "change_points": change_points}
-    if may_end:
-        until, entries = {f"until_{place}": (never, of_place)}, np.array([[[1.0, first - 1.5, middle]]])
-        declared |= {"parameters": size | until | begin, "entries": entries, "never": never}
-    else:
-        declared |= {"parameters": size | begin, "entries": np.array([[[1.0, middle]]])}
-    return Modulation(at_rows, [{**declared, "kind": StepEffect}])
+    never = Fixed(first - 2.0, first - 1.0) if may_end else None
+    until: Declared = {} if never is None else {f"until_{place}": (never, unit)}
+    parameters: Declared = {"a": (AMPLITUDE, of.unit), **until, f"at_{place}": (Uniform(first, last), unit)}
+    bank = single_column_bank(1.0, *([first - 1.5] if may_end else []), 0.5 * (first + last))
+    more: dict[str, Any] = {"kind": StepEffect, "change_points": points, "never": never}
+    yield from of.varying(about, name, at_rows, parameters, ("row",) if by_row else ("time",), says, bank, **more)
 
 
-def value_per_run_modulation(about: ReferenceFit, what: str, unit: str) -> Modulation:
-    """Return a variation by one value per run: a_run; 0 for runs outside the recording that are like none of it."""
+def form_per_run(about: ReferenceFit, name: str, of: Quantity) -> Iterator[Effect]:
+    """Yield a variation by one value per run: a_run; 0 for runs outside the recording that are like none of it.
+
+    The values have one scale in common, unless they are so many that a single one could not differ much more than the
+    others within the bounds of a coordinate.
+    """
     names = about.table.scan_names
     known = {name: k for k, name in enumerate(names)}
 
@@ -263,21 +289,26 @@ def value_per_run_modulation(about: ReferenceFit, what: str, unit: str) -> Modul
 
     def says(mean: FloatArray, sd: FloatArray) -> str:
         far = int(np.argmax(np.abs(mean)))
-        by = value_with_sd(mean[far], sd[far], unit)
-        return f"{what} differs from run to run, most in run {names[far]}: by {by}"
+        by = value_with_sd(mean[far], sd[far], of.unit)
+        return f"{of.what} differs from run to run, most in run {names[far]}: by {by}"
 
-    parameters = {f"values[{name}]": (AMPLITUDE, unit) for name in names}
-    return Modulation(at_rows, [{"parameters": parameters, "covariates": ("run",), "says": says}])
+    parameters: Declared = {f"values[{name}]": (AMPLITUDE, of.unit) for name in names}
+    for form in of.varying(about, name, at_rows, parameters, ("run",), says):
+        if len(names) > _MOST_OF_ONE_SCALE:
+            yield form
+        else:  # all runs may differ about as much, or one of them alone by far more than the others
+            together = SharedScalePrior(form.prior.names, cast(Any, next(iter(form.marginals.values()))))
+            yield replace(form, parameters=together, alternatives=(form,))
 
 
-def modulations_over_rows(about: ReferenceFit) -> dict[str, Callable[..., Modulation]]:
+def forms_over_rows(about: ReferenceFit) -> dict[str, Callable[..., Iterator[Effect]]]:
     """Return a drift where time passes, a step, and a value per run where there are several, by what each is called.
 
-    Each is a function of the fit, and of a quantity's name and unit.
+    Each is a function of the fit, the form's name and a quantity.
     """
-    drift = {"drift": linear_drift_modulation} if about.table.has_varying_time else {}
-    per_run = {"per_run": value_per_run_modulation} if about.can_fit_value_per_run else {}
-    return {**drift, "step": change_point_step_modulation, **per_run}
+    drift = {"drift": drift_form} if about.table.has_varying_time else {}
+    per_run = {"per_run": form_per_run} if about.can_fit_value_per_run else {}
+    return {**drift, "step": step_form, **per_run}
 
 
 def declared_wave(about: ReferenceFit, frequencies: FloatArray, unit: str, highest: float = 0.0) -> dict[str, Any]:
@@ -293,8 +324,8 @@ def declared_wave(about: ReferenceFit, frequencies: FloatArray, unit: str, highe
     }
 
 
-def sinusoid_modulation(about: ReferenceFit, what: str, unit: str) -> Modulation:
-    """Return the modulation by a wave whose frequency the residuals of the fit may suggest."""
+def wave_form(about: ReferenceFit, name: str, of: Quantity) -> Iterator[Effect]:
+    """Yield a wave in time, of a frequency that the residuals of the fit may suggest."""
     frequencies, origin = trial_frequencies_in_time(about), origin_of_column(about.table.time_s)
     suggested, highest = residual_peaks(about, frequencies)
 
@@ -302,32 +333,11 @@ def sinusoid_modulation(about: ReferenceFit, what: str, unit: str) -> Modulation
         return np.asarray(theta[:, :1] * np.sin(2 * np.pi * theta[:, 1:2] * (rows.time_s - origin) + theta[:, 2:3]))
 
     def says(mean: FloatArray, sd: FloatArray) -> str:
-        size, period = value_with_sd(mean[0], sd[0], unit), period_with_sd(mean[1], sd[1], about.time_unit)
-        return f"{what} oscillates with an amplitude of {size} and a period of {period}"
+        size, period = value_with_sd(mean[0], sd[0], of.unit), period_with_sd(mean[1], sd[1], about.time_unit)
+        return f"{of.what} oscillates with an amplitude of {size} and a period of {period}"
 
-    own = {"says": says, "suggested": suggested, **declared_wave(about, frequencies, unit, highest)}
-    return Modulation(at_rows, [own])
-
-
-def modulated_form(
-    about: ReferenceFit, name: str, stage: Stage, how: Modulation, act: Act, guess: float, *covariates: str
-) -> Iterator[Effect]:
-    """Yield the form by which a quantity varies over the rows as `how`, applied by `act`; none if without effect.
-
-    Several values have one scale in common, unless they are so many that a single one could not differ much more than
-    the others within the bounds of a coordinate.
-    """
-    forms = list[Effect]()
-    for variant in how.variants:
-        given = variant | {"covariates": variant["covariates"] + covariates}
-        forms += about.form(name, stage, act=act, guess=guess, **given)
-    if len(forms) == 1 and 1 < len(forms[0].amplitudes) <= _MOST_OF_ONE_SCALE:
-        # All runs may differ about as much, or one of them alone by far more than the others.
-        names = forms[0].prior.names
-        together = SharedScalePrior(names, cast(Any, forms[0].marginals[names[0]]))
-        forms.insert(0, replace(forms[0], parameters=together))
-    if forms:
-        yield replace(forms[0], alternatives=tuple(forms[1:]))
+    own = declared_wave(about, frequencies, of.unit, highest)
+    return of.varying(about, name, at_rows, says=says, suggested=suggested, **own)
 
 
 _KINDS = {"drift": "drifts", "step": "steps", "per_run": "differs"}
@@ -338,24 +348,20 @@ def forms_on_parameters(about: ReferenceFit) -> Iterator[Effect]:
     """Yield a form for each way in which a parameter may vary: drift, step, one value per run, with a column."""
     simulator, table = about.system.simulator, about.table
     values = about.system.parameters(about.theta, table)
-    over = {_KINDS[kind]: modulation for kind, modulation in modulations_over_rows(about).items()}
     for name, prior in simulator.parameters.items():
         guess = 1e-4 * (float(np.abs(values[name]).max()) or float(np.ptp(prior.from_unit(_QUARTILES))))
 
-        def varied(form: str, how: Modulation, size: float, name: str = name) -> Iterator[Effect]:
-            def act(value: Any, theta: FloatArray, table: RunTable) -> Any:
-                return {**value, name: value[name] + how.at_rows(theta, table)}
+        def add(value: Any, change: FloatArray, name: str = name) -> Any:
+            return {**value, name: value[name] + change}
 
-            return modulated_form(about, form, Stage.PARAMETER, how, act, size)
-
-        of = name, unit_of_name(name)
-        for kind, modulation in over.items():
-            if kind != "differs" or name not in simulator.per_run:
-                size = guess / (about.duration if kind == "drifts" else 1.0)
-                yield from varied(f"{kind}:{name}", modulation(about, *of), size)
+        of = Quantity(name, unit_of_name(name), Stage.PARAMETER, guess, add)
+        for kind, form in forms_over_rows(about).items():
+            if kind != "per_run" or name not in simulator.per_run:
+                slow = replace(of, guess=guess / about.duration) if kind == "drift" else of
+                yield from form(about, f"{_KINDS[kind]}:{name}", slow)
         for column in about.varying_columns:
-            how = column_proportional_modulation(about, *of, column)
-            yield from varied(f"depends:{name}:{column}", how, guess / float(np.nanstd(table.covariates[column])))
+            of_column = replace(of, guess=guess / float(np.nanstd(table.covariates[column])))
+            yield from form_along_column(about, f"depends:{name}:{column}", of_column, column)
 
 
 def forms_of_extras(about: ReferenceFit) -> Iterator[Effect]:

@@ -30,12 +30,11 @@ from probewise.priors import HeavyTailedPrior, LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.modulations import (
     OUTLYING,
-    Modulation,
-    column_proportional_modulation,
-    modulated_form,
-    modulations_over_rows,
-    sinusoid_modulation,
+    Quantity,
+    form_along_column,
+    forms_over_rows,
     time_since_start_of_run,
+    wave_form,
 )
 from probewise.systems.forms.reference import N_SIZES, Clipping, ReferenceFit, flag, switch_points
 from probewise.systems.table import RunTable, covariate_of_column
@@ -179,30 +178,21 @@ def forms_on_readings(about: ReferenceFit) -> Iterator[Effect]:
     """Yield every form of the reading that could be detectable in this table."""
     own, zero = about.system.simulator, about.system.simulator.noise.zero
     span = float(np.ptp(about.predicted)) or about.sd
-
-    def added(name: str, how: Modulation) -> Iterator[Effect]:
-        own = (name, Stage.OFFSET, how, lambda y, theta, rows: y + how.at_rows(theta, rows), about.sd)
-        return modulated_form(about, *own)
-
-    def scaled(name: str, how: Modulation) -> Iterator[Effect]:
-        def act(value: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:
-            return zero + (value - zero) * (1 + how.at_rows(theta, rows))
-
-        return modulated_form(about, name, Stage.GAIN, how, act, about.sd / span, "level")
-
-    reading, of_gain = (own.reading, own.unit), (f"the gain of {own.reading}", "1")
-    for kind, modulation in modulations_over_rows(about).items():
-        yield from added(f"offset_{kind}", modulation(about, *reading))
+    reading = Quantity(own.reading, own.unit, Stage.OFFSET, about.sd, lambda y, change: y + change)
+    called, scaled = f"the gain of {own.reading}", lambda y, change: zero + (y - zero) * (1 + change)
+    gain = Quantity(called, "1", Stage.GAIN, about.sd / span, scaled, ("level",))
+    for kind, form in forms_over_rows(about).items():
+        yield from form(about, f"offset_{kind}", reading)
         ends = {"may_end": True} if kind == "step" else {}  # rows may be in another unit for a while
-        yield from scaled(f"gain_{kind}", modulation(about, *of_gain, **ends))
+        yield from form(about, f"gain_{kind}", gain, **ends)
     if about.table.has_varying_time:
-        yield from added("interference", sinusoid_modulation(about, *reading))
+        yield from wave_form(about, "interference", reading)
         yield from _settling_form(about)
         lags, dead = np.geomspace(0.02, 200.0, 33), np.geomspace(1e-3, 100.0, 41)
         yield from _late_form(about, "lag", lagged_readings, lags, "lags with a time constant of {0}")
         yield from _late_form(about, "delay", delayed_readings, dead, "is delayed by {0}")
     for name in about.varying_columns:
-        yield from added(f"sensitivity:{name}", column_proportional_modulation(about, *reading, name))
+        yield from form_along_column(about, f"sensitivity:{name}", reading, name)
         yield from _curve_form(about, name)
         if name not in about.states:
             yield from _friction_form(about, name)

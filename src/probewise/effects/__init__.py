@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 from probewise.effects import noise, optics, pose, reading
-from probewise.effects.effect import AGAIN, Effect, Estimated, Known, LightEffect, NoiseEffect, light_effect
+from probewise.effects.effect import AGAIN, Effect, Known, LightEffect, NoiseEffect, light_effect
 from probewise.effects.reference import Extent, Origin
 from probewise.priors import HeavyTailedPrior, LogHeavyTailedPrior
 
@@ -123,7 +123,6 @@ __all__ = [
     "RARE_EFFECTS",
     "VOCABULARY",
     "Effect",
-    "Estimated",
     "Extent",
     "HeavyTailedPrior",
     "Known",

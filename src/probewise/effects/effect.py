@@ -646,26 +646,6 @@ class WrappedEffect(stages.Effect[V]):
 
 
 @dataclass(frozen=True)
-class Known(WrappedEffect[V]):
-    """An effect with fixed parameters, none of them free; `values` are in the order of `effect.prior.names`."""
-
-    effect: stages.Effect[V]
-    values: tuple[float, ...]
-
-    def __post_init__(self) -> None:
-        names = self.effect.prior.names
-        require(len(self.values) == len(names), "values", self.values, f"one number for each of {names}")
-
-    @property
-    def prior(self) -> Product:
-        return Product({})
-
-    def apply(self, value: V, theta: FloatArray, plan: Plan) -> V:
-        """Apply the effect with the fixed values; theta is (n_samples, 0)."""
-        return self.effect.apply(value, np.array([self.values]), plan)
-
-
-@dataclass(frozen=True)
 class Informed(WrappedEffect[V]):
     """An effect with the prior `own`, from earlier knowledge of its parameters, in place of the usual prior."""
 
@@ -678,19 +658,29 @@ class Informed(WrappedEffect[V]):
 
 
 @dataclass(frozen=True)
-class Estimated(Known[V]):
-    """An effect fixed at an estimate of its parameters, which also holds their uncertainty.
+class Known(WrappedEffect[V]):
+    """An effect with fixed parameters, none of them free; `values` are in the order of `effect.prior.names`.
 
-    `marginals` are the distributions of the parameters, in the order of `values`. A run that trusts its sensor uses the
-    values; one that doubts it infers the parameters along with the shape (`informed`).
+    Where they are estimates, `marginals` are their distributions, in the same order: a run that trusts its sensor uses
+    the values, one that doubts it infers the parameters along with the shape (`informed`).
     """
 
+    effect: stages.Effect[V]
+    values: tuple[float, ...]
     marginals: tuple[Marginal, ...] = ()
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        as_many = len(self.marginals) == len(self.values)
-        require(as_many, "marginals", self.marginals, "as many as values, one for each")
+        names = self.effect.prior.names
+        require(len(self.values) == len(names), "values", self.values, f"one number for each of {names}")
+        require(len(self.marginals) in (0, len(names)), "marginals", self.marginals, f"a prior for each of {names}")
+
+    @property
+    def prior(self) -> Product:
+        return Product({})
+
+    def apply(self, value: V, theta: FloatArray, plan: Plan) -> V:
+        """Apply the effect with the fixed values; theta is (n_samples, 0)."""
+        return self.effect.apply(value, np.array([self.values]), plan)
 
     @property
     def informed(self) -> Informed[V]:

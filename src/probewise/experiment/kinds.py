@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray, logsumexp, read_only_floats
-from probewise.effects import Estimated
+from probewise.effects import Known
 from probewise.experiment.rivals import DescribedEffect, SensorModelRival, powers_of_s
 from probewise.inference.problem import Likelihood, SensorProblem, checked_log_prob
 from probewise.inquiry import TabulatedChain
@@ -183,11 +183,12 @@ def _prior_and_model_with_estimated_effects(
     prior: Prior, chain: SensorModel, quick: SensorModel
 ) -> tuple[Prior, SensorModel]:
     """Return prior and model with parameters for the effects that a repair of the sensor estimated, if any."""
-    estimated = [e for e in chain.effects if isinstance(e, Estimated)] if isinstance(chain, Chain) else []
+    effects = chain.effects if isinstance(chain, Chain) else ()
+    estimated = [effect for effect in effects if isinstance(effect, Known) and effect.marginals]
     if not estimated or not isinstance(chain, Chain):
         return prior, quick
     informed = [effect.informed for effect in estimated]
-    known = tuple(effect for effect in chain.effects if not isinstance(effect, Estimated))
+    known = tuple(effect for effect in chain.effects if effect not in estimated)
     acting = replace(chain, effects=(*known, *informed))
     both = Joint((prior, *(_PrefixedPrior(effect.name, effect.prior) for effect in informed)))
     return both, TabulatedChain.of(acting, quick) or acting

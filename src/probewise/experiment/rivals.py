@@ -4,15 +4,14 @@ The effects and their typical sizes are those of the diagnosis. But before the f
 of places and times. So effects of the pose and of the footprint take their scales from a scan of 100 mm, as in a
 calibration; effects that change with the place, from the whole field. Effects in time use paced time, which is 0 at the
 first reading and scaled so that each reading takes eight seconds on average: their priors are set before the speed of
-the instrument is known. Effects too small for a dozen readings are excluded (`EffectWithRunPrior`).
+the instrument is known. Effects too small for a dozen readings are excluded (`_prior_for_run`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any, Protocol, Self, cast
 
 import numpy as np
@@ -36,7 +35,7 @@ from probewise.effects.optics import PatchPrior
 from probewise.errors import ParameterError
 from probewise.experiment.noise_rivals import DeclaredNoise, noise_likelihoods
 from probewise.inference.problem import Likelihood
-from probewise.priors import LogUniform, Prior, Product, Uniform
+from probewise.priors import LogUniform, Marginal, Uniform
 from probewise.recordings.plan import Instrumentation, Plan
 from probewise.sensor import Chain, FixedLevels
 from probewise.sensor.chain import cards_of
@@ -102,7 +101,7 @@ def rivals_of(
 
 def _ways_in_run(effect: Effect, field_mm: tuple[float, float]) -> list[DescribedEffect]:
     """Return the ways in which an effect may act in a run, with a run's prior; effects of time act in paced time."""
-    in_run = EffectWithRunPrior(effect, field_mm)
+    in_run = replace(effect, parameters=_prior_for_run(effect, field_mm))
     if effect.name in OF_MOTION:
         return [in_run, FromRest(in_run)]
     return [EffectInPacedTime(in_run) if effect.name in _IN_TIME else in_run]
@@ -238,35 +237,24 @@ class _WrappedDescribedEffect(WrappedEffect[Any]):
         return self.effect.sentence(mean, sd)
 
 
-@dataclass(frozen=True, eq=False)
-class EffectWithRunPrior(_WrappedDescribedEffect):
-    """An effect with the prior for a single run: sizes large enough to matter, and times within the run.
+def _prior_for_run(effect: Effect, field_mm: tuple[float, float]) -> Mapping[str, Marginal]:
+    """Return an effect's priors for a single run: sizes large enough to matter, and times within the run.
 
     A diagnosis of hundreds of readings weighs effects of all sizes, most of them far too small to change the dozen
     readings of a run or its shape. A change point is log-uniform over up to a hundred readings. A patch may lie
     anywhere on the field, of width and height `field_mm`, not only along scanned lines.
     """
-
-    effect: Effect
-    field_mm: tuple[float, float]
-
-    @cached_property
-    def prior(self) -> Prior:
-        """The effect's prior for a run."""
-        prior = self.effect.prior
-        if isinstance(prior, PatchPrior):
-            size = HeavyTailedPrior(prior.typical, smallest=_SMALLEST)
-            x, y = (Uniform(0.0, length) for length in self.field_mm)
-            return Product({prior.size: size, "x": x, "y": y, "r": prior.radius_prior})
-        if not isinstance(prior, Product):
-            return prior
-        marginals = dict(prior.marginals)
-        for name, marginal in marginals.items():
-            if isinstance(marginal, HeavyTailedPrior | LogHeavyTailedPrior):
-                marginals[name] = replace(marginal, smallest=_SMALLEST)
-            elif name == "at_s":
-                marginals[name] = _CHANGE_POINT
-        return Product(marginals)
+    if isinstance(prior := effect.prior, PatchPrior):
+        size = HeavyTailedPrior(prior.typical, smallest=_SMALLEST)
+        x, y = (Uniform(0.0, length) for length in field_mm)
+        return {prior.size: size, "x": x, "y": y, "r": prior.radius_prior}
+    marginals = dict(effect.marginals)
+    for name, marginal in marginals.items():
+        if isinstance(marginal, HeavyTailedPrior | LogHeavyTailedPrior):
+            marginals[name] = replace(marginal, smallest=_SMALLEST)
+        elif name == "at_s":
+            marginals[name] = _CHANGE_POINT
+    return marginals
 
 
 @dataclass(frozen=True, eq=False)

@@ -217,7 +217,8 @@ def drift_form(about: ReferenceFit, name: str, of: Quantity) -> Iterator[Effect]
         return np.asarray(theta[:, :1] * along)
 
     size: Declared = {"a": (AMPLITUDE, f"{of.unit or '1'}/{per}")}
-    more, variants = {"counted_from": origin_in_words(table.time, origin, per)}, list[Effect]()
+    more: dict[str, Any] = {"counted_from": origin_in_words(table.time, origin, per)}
+    variants = list[Effect]()
     if not follow_each_other:
         variants += of.varying(about, name, at_rows, size, ("time",), says, **more)
     for value, prior in map(flag, (False, True)) if follow_each_other else ():

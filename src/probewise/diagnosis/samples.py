@@ -381,16 +381,17 @@ def draw_models(
     or if it leads by little.
     """
     cached, fit, null = HypothesisSamples(searched, best.noise, rng, progress), best.fit, test.null
+    by_mean = searched.posterior.marginal_over_noise
     model = samples = cached.averaged(fit)
     if judged.verdict == "unknown":
         doubt = _DOUBT_BESIDE
         if effects_out_of_vocabulary(fit.names):
-            doubt = max(1 - searched.posterior.marginal_over_noise[fit.names], _LEAST_DOUBT)
+            # What has more beside the formula does not doubt it.
+            doubt = max(1 - sum(p for names, p in by_mean.items() if {*fit.names} <= {*names}), _LEAST_DOUBT)
         model = cached.averaged(fit, {fit.names: 1 - doubt, (): doubt})
     elif judged.verdict in ("named", "cannot_tell") and fit.names:
         model = cached.averaged(fit, cached.compatible_probabilities(fit))
     elif not (judged.too_little or judged.withdrawn):  # no effect is named: the null is what named ones leave
-        by_mean = searched.posterior.marginal_over_noise
         named = [names for _, names in searched.evidences.fits if not effects_out_of_vocabulary(names)]
         lead = searched.best_refit_of(max(named, key=lambda names: by_mean.get(names, 0.0)), best.noise) or null
         if lead.names and predicts_far_worse(BestRepair.of(searched, test, lead, best.noise, rng=rng).improvement):

@@ -105,6 +105,14 @@ def test_what_predicts_the_same_as_a_name_is_left_out():
     assert (1, PUSH) not in stay
 
 
+@pytest.mark.parametrize(("behind", "goes"), [(2.0, False), (4.0, True)])
+def test_what_is_poorer_than_something_left_out_for_a_name_is_left_out_too(behind, goes):
+    """A log that a curve follows is that curve; an exponential that follows neither must not lead in its place."""
+    poorer = Held(("reflection",), -behind, left=1.0)
+    fits = by_key(Held((), -50.0), Held(NAME, -9.0), Held(PUSH, 0.0, left=0.3), poorer)
+    assert prune_out_of_vocabulary(fits, NOISES)[1] == ({PUSH, poorer.names} if goes else {PUSH})
+
+
 @pytest.mark.parametrize(
     ("name", "beside", "speaks"),
     [(-1.0, 0.0, True), (-1.0, 2.5, False), (-4.0, -4.0, False)],

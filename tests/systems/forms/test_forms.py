@@ -481,3 +481,11 @@ def test_rows_are_predicted_alone_only_where_neither_the_simulator_nor_an_effect
     assert not {"lag", "delay", "hysteresis", "backlash:drive", "input_delay:drive"} & alone
     adding_up = System.of(_simulator(simulate=lambda p, u: p["offset"] + p["gain"] * np.cumsum(u["drive"])), TABLE)
     assert adding_up.part_that_predicts(rows, TABLE, ())[0] is TABLE
+
+
+def test_a_share_of_the_reading_fades_from_the_start_of_each_run():
+    form = _proposed("s the t_s since the start of the run")
+    y = np.linspace(1.0, 3.0, N_ROWS)[None, :]
+    since = np.concatenate([_T[rows] - _T[rows][0] for rows in (slice(0, N_ROWS // 2), slice(N_ROWS // 2, N_ROWS))])
+    found = form.apply(y, np.array([[0.2, 1.5]]), TABLE)[0]
+    np.testing.assert_allclose(found, y[0] * (1 + 0.2 * np.exp(-since / 1.5)))

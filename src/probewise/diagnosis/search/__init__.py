@@ -251,12 +251,12 @@ class SearchState:
         return self.store_candidate(both) if both.is_significantly_better(between) else None
 
     def screened_log_evidences(self) -> dict[EffectNames, float]:
-        """Return the log evidence of (mean, noise) by screening, for combinations that were not refitted.
+        """Return the log evidence of (mean, noise) by screening, of what was not refitted and contains nothing dropped.
 
         Screening about a fit with part of the effects is more accurate than about the null, which is corrected for
         refits of parts. `optimism` (nats) is subtracted, unless a refit has shown that an effect is insignificant.
         """
-        refitted = self.refitted_combinations
+        refitted, pruned = self.refitted_combinations, [{*names} for names in self.pruned]
         out = {}
         for (names, noise), value in self.about_null.items():
             gains = [
@@ -270,7 +270,7 @@ class SearchState:
         return {
             key: value if key[0] in self.undetected else value - self.optimism
             for key, value in out.items()
-            if key[0] not in refitted | self.pruned
+            if key[0] not in refitted and not any(dropped <= {*key[0]} for dropped in pruned)
         }
 
     def log_evidence(self, names: Names) -> float:
@@ -617,8 +617,10 @@ def prune_out_of_vocabulary(
 ) -> tuple[dict[tuple[int, Names], WeighedFit], set[Names]]:
     """Drop or penalise combinations out of vocabulary that compete with named ones of no more effects.
 
-    A combination is dropped if it predicts so much the same as a named one that its expected lead is below three nats.
-    If its observed lead is below three nats, its evidence is reduced to that of the best named one.
+    A combination is dropped if it predicts so much the same as a named one that its expected lead is below three nats,
+    or if one that is dropped so, of no more effects, is ahead of it by three: a log that a curve follows is that curve,
+    and the exponential that comes next is not. If its observed lead over the best named one is below three nats, its
+    evidence is reduced to that of this one.
 
     Returns the candidates that stay, and the combinations that were dropped.
     """
@@ -627,14 +629,18 @@ def prune_out_of_vocabulary(
         return noises.average_log_evidence(candidate.log_z_by_noise)
 
     leading = {c.names: c for c in sorted(candidates.values(), key=average_log_evidence) if c.names}
-    stay, pruned = dict(candidates), set()
-    for names, candidate in leading.items():
+    stay, pruned, best_dropped = dict(candidates), set[Names](), dict[int, float]()
+    for names, candidate in reversed(leading.items()):
         if not effects_out_of_vocabulary(names):
             continue
-        rivals = [c for c in leading.values() if not effects_out_of_vocabulary(c.names) and len(c.names) <= len(names)]
+        own, n = average_log_evidence(candidate), len(names)
+        rivals = [c for c in leading.values() if not effects_out_of_vocabulary(c.names) and len(c.names) <= n]
         if any(expected_log_bayes_factor(candidate, c) < ENOUGH_NATS for c in rivals):
             pruned.add(names)
-        ahead = average_log_evidence(candidate) - max((average_log_evidence(c) for c in rivals), default=-np.inf)
+            best_dropped.setdefault(n, own)
+        elif any(m <= n and value > own + ENOUGH_NATS for m, value in best_dropped.items()):
+            pruned.add(names)
+        ahead = own - max((average_log_evidence(c) for c in rivals), default=-np.inf)
         if 0 < ahead < ENOUGH_NATS:
             for key in [key for key in stay if key[1] == names]:
                 stay[key] = stay[key].with_variant_factor_and_weights(stay[key].log_share - ahead, stay[key].weights)

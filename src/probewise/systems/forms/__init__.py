@@ -34,7 +34,7 @@ WORDS: Mapping[str, str] = MappingProxyType(
         "offset_per_run": "an offset that differs from run to run",
         "gain_per_run": "a gain that differs from run to run",
         "delay": "a delay of the readings",
-        "settling": "readings that settle at the start of each run",
+        "settling": "readings that settle after the start",
         "interference": "a wave in the readings",
         "sensitivity": "readings that depend on {0}",
         "curve": "readings that follow a curve of {0}",

@@ -37,9 +37,11 @@ from probewise.systems.forms.modulations import (
     origin_in_words,
     origin_of_column,
     text_rounded_to_spread,
+    time_since_start_of_run,
     trial_frequencies_in_time,
 )
-from probewise.systems.forms.reference import ReferenceFit, switch_points
+from probewise.systems.forms.readings import settling_time_prior
+from probewise.systems.forms.reference import N_SIZES, ReferenceFit, switch_points
 from probewise.systems.table import RunTable, covariate_of_column
 
 _MOST_SWITCHES = 128  # thresholds of a switch in a column
@@ -98,6 +100,7 @@ def formula_forms(about: ReferenceFit) -> Iterator[Effect]:
         yield from _varying_influence_form(about, name, values)
         yield from _dose_forms(about, name, values)
     if in_time:
+        yield from _fading_gain_form(about)
         yield from _square_wave_form(about)
         yield from _swept_wave_form(about)
     still = [_Variable.of(name, column, 0.0) for name, column in about.states.items() if varies(column)]
@@ -267,6 +270,25 @@ def _forms_of_terms(
         names = dict.fromkeys(variable.name for variable in variables)
         covariates = tuple(along.get(name) or covariate_of_column(name) for name in names)
         yield from _proposal(about, text, {"a": (AMPLITUDE, "")}, change, covariates, guess=guess, state=state)
+
+
+def _fading_gain_form(about: ReferenceFit) -> Iterator[Effect]:
+    """Yield a share of the reading that fades from the start of each run: creep, warming up, a second decay."""
+    own, prior = about.system.simulator, settling_time_prior(about)
+
+    def change(value: Any, rows: RunTable, a: Any, tau_s: Any) -> Any:
+        return a * (value - own.noise.zero) * np.exp(-time_since_start_of_run(rows) / tau_s)
+
+    faded = f"({own.reading} - {own.noise.zero:g})" if own.noise.zero else own.reading
+    yield from _proposal(
+        about,
+        f"{faded} exp(-s / tau_s), s the {about.table.time} since the start of the run",
+        {"a": (AMPLITUDE, "1"), "tau_s": (prior, about.time_unit)},
+        change,
+        ("time", "run"),
+        single_column_bank(1.0, np.geomspace(1.5 * prior.low, 0.5 * prior.high, N_SIZES)),
+        guess=1.0,
+    )
 
 
 def _square_wave_form(about: ReferenceFit) -> Iterator[Effect]:

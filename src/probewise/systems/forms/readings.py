@@ -272,7 +272,8 @@ def settling_time_prior(about: ReferenceFit) -> LogUniform:
 def _settling_form(about: ReferenceFit) -> Iterator[Effect]:
     prior, units = settling_time_prior(about), (about.reading_unit, about.time_unit)
     act = acting(lambda value, rows, a, tau_s: value + a * np.exp(-time_since_start_of_run(rows) / tau_s))
-    says = "is off by {0} at the start of each run, and settles with a time constant of {1}"
+    start = "the start" + " of each run" * (len(about.table.scan_names) > 1)
+    says = f"is off by {{0}} at {start}, and settles with a time constant of {{1}}"
     words, taus = f"{about.system.simulator.reading} {says}", np.geomspace(prior.low * 1.5, 0.5 * prior.high, N_SIZES)
     parameters: Declared = {"a": (AMPLITUDE, units[0]), "tau_s": (prior, units[1])}
     own = (parameters, ("time", "run"), act, in_words(words, *units), single_column_bank(1.0, taus))

@@ -226,6 +226,17 @@ MISTAKES = {
         lambda: simulator(simulate="oven.py"),
         r"simulate is 'oven.py'; .*read_simulator\('FILE.py'\)",
     ),
+    "a text for a flag": (lambda: simulator(vectorized="no"), "vectorized is 'no'; allowed: True or False"),
+    "a text for a flag of a fit": (lambda: fitted(OVEN, TABLE, thorough="no"), "thorough is 'no'; allowed: True or"),
+    "a unit that no font has": (lambda: simulator(unit="\ud800"), r"unit is '\\ud800'; .*, no control characters"),
+    "a parameter on two lines": (
+        lambda: simulator(parameters={"a\nb": (0, 1)}),
+        "a name in parameters is .*, no control",
+    ),
+    "the reading as a control": (
+        lambda: fitted(simulator(controls=["temp_c"]), TABLE),
+        "controls is 'temp_c'; allowed",
+    ),
     "a number for the noise": (lambda: simulator(noise=0.05), "noise is 0.05; .*was {'sd': 0.05} meant"),
     "one name for several": (
         lambda: simulator(run="run", per_run="tau_s"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import math
 import os
+import re
 import sys
 import warnings
 from collections.abc import Mapping, Sequence
@@ -19,6 +20,7 @@ from probewise.errors import ParameterError, UnitWarning, did_you_mean, require
 
 _FULL_TURN_RAD = math.tau * (1 + 1e-9)
 _MOST = 10_000_000  # of anything that is counted: more fill the memory
+_CONTROL = re.compile("[\\x00-\\x1f\\x7f\\ud800-\\udfff]")  # and lone surrogates: no font has them, and no file
 _MOST_LISTED = 250  # characters of names, so that what was perhaps meant is not cut off
 
 
@@ -158,6 +160,11 @@ def checked_text(name: str, value: object, allowed: str = "a text") -> str:
     raise ParameterError(name, value, allowed)
 
 
+def require_plain_text(name: str, value: object, allowed: str = "a text") -> None:
+    """Raise ParameterError unless `value` is a text, which may be empty, without control characters."""
+    require(isinstance(value, str) and not _CONTROL.search(value), name, value, f"{allowed}, no control characters")
+
+
 def checked_texts(name: str, value: object, allowed: str) -> tuple[str, ...]:
     """Return several texts, none empty, as a tuple; raise ParameterError for anything else, also for a single text.
 
@@ -177,4 +184,4 @@ def require_mapping(name: str, value: object, allowed: str) -> None:
     require_kind(name, value, Mapping, allowed)
     assert isinstance(value, Mapping)
     for each in value:
-        checked_text(f"a name in {name}", each)
+        require_plain_text(f"a name in {name}", checked_text(f"a name in {name}", each))

@@ -27,8 +27,9 @@ from probewise.errors import FileError, NotDrawnError, ParameterError, message_o
 from probewise.progress import Progress, silent
 
 PAGE = "report.html"
-_STAGED, _COMPLETE = ".probewise-writing", ".probewise-complete"  # no person's folder has such a name
-_LIST, _BEFORE = ".probewise-written", ".probewise-before"  # {name: SHA-256} of files, in JSON
+_HIDDEN = ".probewise-"  # no person's folder has such a name
+_STAGED, _COMPLETE = f"{_HIDDEN}writing", f"{_HIDDEN}complete"
+_LIST, _BEFORE = f"{_HIDDEN}written", f"{_HIDDEN}before"  # {name: SHA-256} of files, in JSON
 _KEPT = "_kept"  # ends the name, without its ending, of a person's file that a result would have replaced
 _MOST_FAILED = 3  # drawings that a message names
 _MAIN_FILES = {
@@ -170,7 +171,7 @@ def checked_output_directory(path: Path, *entries: str, main: str = "", option: 
     import tempfile  # here, as help needs none
 
     try:  # permissions are not enough: /proc and read-only mounts cannot be written to
-        os.rmdir(tempfile.mkdtemp(prefix=".probewise-", dir=nearest))
+        os.rmdir(tempfile.mkdtemp(prefix=_HIDDEN, dir=nearest))
     except OSError as error:
         raise FileError(path, f"{nearest} cannot be written to", "a directory you may write to") from error
     return path
@@ -243,7 +244,10 @@ def staged_output(
     with _errors_of(out, "made", "a directory you may write to"):
         out.mkdir(parents=True, exist_ok=True)
     with hold_lock(out / "results", patience_s=_PATIENCE_S):
-        stage = StagedFiles(folder)
+        stage, inside = StagedFiles(folder), Path(os.path.realpath(out))
+        for path in map(Path, map(os.path.realpath, inputs)):
+            if inside in path.parents and path.relative_to(inside).parts[0].startswith(_HIDDEN):
+                raise FileError(path, "an input has a name that results need", "another folder for the results")
         stage.kept |= _move_into_place(out)
         _remove(folder)
         folder.mkdir()

@@ -110,6 +110,16 @@ def test_nothing_outside_a_hostile_folder_changes_and_the_way_out_is_said(build,
     assert not (out / "report.html").is_symlink()
 
 
+def test_an_input_that_has_the_name_of_a_hidden_folder_is_kept(tmp_path):
+    (tmp_path / ".probewise-writing").write_text("precious")
+    with (
+        pytest.raises(FileError, match="an input has a name that results need"),
+        staged_output(tmp_path, inputs=[tmp_path / ".probewise-writing"]),
+    ):
+        pass
+    assert contents(tmp_path) == {".probewise-writing": "precious", ".results.lock": ""}
+
+
 LINKS = {
     "explore": ("journal.jsonl", ".journal.jsonl.lock", "live.html", "frames", "frames/1.png"),
     "investigate": ("rounds", "rounds/1.csv"),

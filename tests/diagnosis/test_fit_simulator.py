@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 
 from probewise.diagnosis import diagnose_system, fit_json, fit_simulator
 from probewise.diagnosis.diagnose_simulator import prepare_system
-from probewise.errors import ParameterError
+from probewise.errors import NotConvergedError, ParameterError
 from probewise.systems import Noise, Simulator, table_for
 
 X = np.linspace(-1.0, 1.0, 60)
@@ -194,3 +195,21 @@ def test_a_model_that_runs_away_or_fits_exactly_or_says_the_same_twice_is_fitted
     fit = fit_simulator(simulator, {"t": t, "y": y}, rng=np.random.default_rng(1))
     assert np.isfinite(fit.fitted.samples).all()
     np.testing.assert_allclose(simulate(fit.fitted.mode(), {"t": t}), y, atol=5 * noise + 1e-6)
+
+
+@pytest.mark.parametrize("told", [np.nan, ValueError])
+def test_where_the_best_fit_lies_beside_what_is_impossible_it_is_fitted_or_refused_in_words(told):
+    """The sd of b is 0.02; readings are impossible within 0.1 of its mode: no step stays clear of them."""
+
+    def simulate(p, data):
+        b = float(p["b"])
+        if abs(b - 2.0) < 0.1 and told is ValueError:
+            raise ValueError(b)
+        return p["a"] + (b if abs(b - 2.0) >= 0.1 else told) * data["x"]
+
+    fit = fit_simulator(line(simulate=simulate), {"x": X, "y": Y}, rng=np.random.default_rng(1))
+    assert abs(fit.fitted.mode()["b"] - 2.0) >= 0.1
+    said = [note for note in fit.recording.notes if note.startswith("simulate raised an error for ")]
+    assert len(said) == (told is ValueError)
+    with contextlib.suppress(NotConvergedError):
+        diagnose_system(line(simulate=simulate), {"x": X, "y": Y}, rng=np.random.default_rng(1))

@@ -1,5 +1,6 @@
 """How a person's function is called: whatever it takes, the same readings."""
 
+import pickle
 from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from probewise.errors import FileError, NotConvergedError, ParameterError, ShapeError
 from probewise.priors import Uniform
 from probewise.systems import Law, RunTable, Simulator, System, read_simulator
-from probewise.systems.calls import Caller, SpreadCalls
+from probewise.systems.calls import Caller, SpreadCalls, progress_with_call_count
 
 X = np.linspace(0, 1, 11)
 
@@ -35,6 +36,14 @@ def test_a_function_that_broadcasts_is_called_once_for_all_samples():
     system.caller.n_calls = 0
     system.chain(table, ()).predict(system.theta(system.starts), table)
     assert system.caller.n_calls == 1
+
+
+def test_a_caller_is_pickled_without_the_progress_that_it_tells():
+    caller = Caller(_elementwise, broadcasts=True)
+    progress_with_call_count(lambda *told: None, caller)("fitting")
+    again = pickle.loads(pickle.dumps(caller))
+    parameters = {"a": np.array([[1.3]]), "b": np.array([[1.1]])}
+    np.testing.assert_array_equal(again(parameters, {"x": X}), caller(parameters, {"x": X}))
 
 
 def test_a_parameter_that_varies_by_row_is_interpolated_where_a_function_takes_only_numbers():

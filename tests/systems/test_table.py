@@ -3,6 +3,7 @@
 import dataclasses
 import datetime
 from collections.abc import Iterator
+from zoneinfo import ZoneInfo
 
 import numpy as np
 import pytest
@@ -76,6 +77,7 @@ def test_a_simulator_gets_names_of_runs_as_numbers_only_if_they_are_different_nu
 
 
 _FIRST = datetime.datetime(2026, 11, 23, 18, 0)
+_END_OF_SUMMER = datetime.datetime(2026, 10, 25, 0, 59, 59, tzinfo=datetime.UTC)  # clocks go back a second later
 _LATER = [datetime.timedelta(seconds=s) for s in (0, 2, 90)]
 
 
@@ -84,6 +86,7 @@ _LATER = [datetime.timedelta(seconds=s) for s in (0, 2, 90)]
     [
         [_FIRST + later for later in _LATER],
         [(_FIRST + later).replace(tzinfo=datetime.UTC) for later in _LATER],
+        [(_END_OF_SUMMER + later).astimezone(ZoneInfo("Europe/Berlin")) for later in _LATER],
         np.array([_FIRST + later for later in _LATER], dtype="datetime64[ns]"),
         np.array(_LATER, dtype="timedelta64[ms]"),
         _LATER,
@@ -96,6 +99,11 @@ def test_dates_clocks_and_time_differences_count_from_the_first_row(times):
     assert table.time_s.tolist() == [0.0, 2.0, 90.0]
     assert table.notes[0].startswith("column 't' counted in s from ")
     np.testing.assert_allclose(RunTable({"t": times}, "t", time_unit="min").time_s, [0, 2 / 60, 1.5])
+
+
+def test_months_count_in_days():
+    table = RunTable({"t": np.array(["2026-01", "2026-03"], dtype="datetime64[M]")}, "t", time_unit="d")
+    assert table.time_s.tolist() == [0.0, 59.0]
 
 
 def test_a_missing_date_is_refused():

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probewise._arrays import BoolArray, FloatArray
-from probewise._kinds import checked_finite_number, require_callable, require_like
+from probewise._kinds import checked_finite_number, require_callable, require_flag, require_like
 from probewise._signals import defer_signals
 from probewise.arm.instrument import Clock, Instrument, Pose, Reading
 from probewise.arm.lego import LegoArm
@@ -116,23 +116,24 @@ class OwnInstrument:
     @property
     def turns(self) -> bool:
         """Whether the object turns its sensor to `pose.orientation_rad`: its attribute `turns`, by default False."""
-        return bool(self._attribute("turns", False))
+        return self._flag("turns")
 
     @property
     def lifts(self) -> bool:
         """Whether the object reads at a given `pose.height_mm`: its attribute `lifts`, by default False."""
-        return bool(self._attribute("lifts", False))
+        return self._flag("lifts")
 
     @property
     def read_height_mm(self) -> float | None:
         """Height above the surface at which the object reads: its attribute `read_height_mm`; None: not known."""
-        height_mm = self._attribute("read_height_mm", None)
         with self._errors_located("read_height_mm"):
+            height_mm = getattr(self._own, "read_height_mm", None)
             return None if height_mm is None else checked_finite_number("read_height_mm of the instrument", height_mm)
 
-    def _attribute(self, name: str, usual: Any) -> Any:
+    def _flag(self, name: str) -> bool:
         with self._errors_located(name):
-            return getattr(self._own, name, usual)
+            require_flag(f"{name} of the instrument", value := getattr(self._own, name, False))
+            return bool(value)
 
     def sentence(self) -> str:
         """Describe the allowed places in words."""

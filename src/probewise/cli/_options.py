@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import math
+import os
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -94,7 +95,7 @@ def parse_path(text: str) -> Path:
     if not text or "\0" in text:
         kind = "a text with a NUL" if text else "an empty text"
         raise argparse.ArgumentTypeError(f"{kind} names no file or directory")
-    return Path(text)
+    return Path(os.path.expanduser(text))  # no shell expands --out=~/results
 
 
 def _recording(text: str) -> Path:

@@ -34,11 +34,18 @@ from probewise.errors import ParameterError, ProbewiseError
 from probewise.priors import LogUniform, Normal, Uniform
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Plan, Recording, masks_of_readings_at_ends
-from probewise.systems import ProgressWithCallCount, RunRecording, RunTable, Simulator, System, as_recording, table_for
+from probewise.systems import (
+    RunRecording,
+    RunTable,
+    Simulator,
+    System,
+    as_recording,
+    progress_with_call_count,
+    table_for,
+)
 from probewise.systems.forms import ReferenceFit, sorting_column
 from probewise.systems.forms.modulations import time_since_start_of_run
 from probewise.systems.forms.reference import note_on_row_order, rows_are_in_order
-from probewise.systems.integrate import Integrations
 from probewise.systems.system import STANDS_STILL, with_converged_step
 
 _STEPS_TRIED = 8  # from each start
@@ -514,7 +521,7 @@ def diagnose_system(
     def diagnosed(simulator: Simulator, *, stiff: bool = False, sought: frozenset[str] | None = None) -> Diagnosis:
         prepared = prepare_system(simulator, table, source=source, notes=notes, progress=progress, stiff=stiff)
         prepared = replace(prepared, sought=sought)
-        told = _progress_with_call_count(progress, cast(SimulatorApparatus, prepared.apparatus).system)
+        told = progress_with_call_count(progress, cast(SimulatorApparatus, prepared.apparatus).system.caller)
         searched = None
         if prepared.has_too_little_data:  # the verdict is that they cannot tell, whatever a search would find
             prior = prepared.apparatus.prior_odds(prepared.effects)
@@ -567,7 +574,7 @@ def prepare_system(
     if recording.censored.any() and n_within < least:
         allowed = f"{least} or more: readings at its ends do not determine the noise"
         raise ParameterError("readings within the declared range", n_within, allowed)
-    told = _progress_with_call_count(progress, system)
+    told = progress_with_call_count(progress, system.caller)
     told("fitting the simulator")
     plain = system
     system, found, sd = fit_system(plain, recording)
@@ -597,44 +604,30 @@ def prepare_system(
     return Prepared(recording, effects, begun, apparatus, recording)
 
 
-def _progress_with_call_count(progress: Progress, system: System) -> Progress:
-    return progress if system.caller is None else ProgressWithCallCount(progress, system.caller)
-
-
 def notes_on_calls(diagnosis: Diagnosis) -> tuple[str, ...]:
     """Return notes on calls of a simulator, or the integration of its law, and on its declared noise; else ()."""
     apparatus = diagnosis.apparatus
     if not isinstance(apparatus, SimulatorApparatus):
         return ()
     white = diagnosis.noise.model == "white"
-    out = [*notes_on_declared_noise(apparatus.system.simulator, diagnosis.repaired.noise_sd)] if white else []
-    caller, done = apparatus.system.caller, apparatus.system.integrations
-    if caller is None:
-        law = apparatus.system.simulator.law
-        sets_step = law is not None and law.max_step_s is not None
-        return (*out, *_notes_on_integration(done, apparatus.evaluations_of_a_search, sets_step=sets_step))
-    if caller.cut_short:
-        out.append(
+    declared = notes_on_declared_noise(apparatus.system.simulator, diagnosis.repaired.noise_sd) if white else ()
+    return (*declared, *notes_on_predictions(apparatus))
+
+
+def notes_on_predictions(apparatus: SimulatorApparatus) -> Iterator[str]:
+    """Yield notes on what was not predicted, or not exactly, by the simulator's function or its law."""
+    caller, done, law = apparatus.system.caller, apparatus.system.integrations, apparatus.system.simulator.law
+    if caller is not None and caller.cut_short:
+        yield (
             f"simulate takes one sample at a time: after {CALLS_OF_A_SEARCH:,} calls some promising combinations of "
             "effects were not fitted; if simulate takes arrays, the search is complete"
         )
-    if caller.n_failed:
-        out.append(f"simulate raised an error for {caller.n_failed:,} parameter vectors, which count as impossible")
-    if caller.interpolated:
-        out.append(
-            f"simulate takes no array of {', '.join(sorted(caller.interpolated))}: each reading is interpolated "
-            "between fixed values, as if the parameter had had that row's value from the start; if earlier rows affect "
-            "later ones, let simulate take arrays, or write a law"
-        )
-    return tuple(out)
-
-
-def _notes_on_integration(done: Integrations, most: int, *, sets_step: bool) -> Iterator[str]:
     if done.cut_short:
-        way_out = "a larger max_step_s, shorter runs" if sets_step else "shorter runs"
+        way_out = "a larger max_step_s, shorter runs" if law is not None and law.max_step_s else "shorter runs"
         yield (
-            f"integrating the law takes long: after {most:,} evaluations of its rates some promising combinations of "
-            f"effects were not fitted; with {way_out} or fewer rows the search is complete"
+            f"integrating the law takes long: after {apparatus.evaluations_of_a_search:,} evaluations of its rates "
+            f"some promising combinations of effects were not fitted; with {way_out} or fewer rows the search is "
+            "complete"
         )
     if done.too_stiff:
         yield (
@@ -642,8 +635,15 @@ def _notes_on_integration(done: Integrations, most: int, *, sets_step: bool) -> 
             "and count as impossible; their intervals may be too narrow; set a shorter max_step_s, or write simulate "
             "with an integrator of your own"
         )
-    if done.n_failed:
-        yield f"rates raised an error for {done.n_failed:,} parameter vectors, which count as impossible"
+    what, n_failed = ("rates", done.n_failed) if caller is None else ("simulate", caller.n_failed)
+    if n_failed:
+        yield f"{what} raised an error for {n_failed:,} parameter vectors, which count as impossible"
+    if caller is not None and caller.interpolated:
+        yield (
+            f"simulate takes no array of {', '.join(sorted(caller.interpolated))}: each reading is interpolated "
+            "between fixed values, as if the parameter had had that row's value from the start; if earlier rows affect "
+            "later ones, let simulate take arrays, or write a law"
+        )
 
 
 _SOUGHT_AGAIN = 1e-4  # probability of a hypothesis, nine nats behind, whose effects are searched again with finer steps

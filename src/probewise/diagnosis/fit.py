@@ -417,6 +417,7 @@ def _fit_coroutine(
             break
     if not exact:
         predicted, slopes = yield from request_slopes(z)
+    slopes = np.where(np.isfinite(slopes), slopes, 0.0)  # a neighbour that is impossible tells nothing
     sd = law.likeliest_sigma_of(readings - predicted)
     return Fit(model, z, predicted, readings - predicted, slopes, sd=sd, objective=best, settled=settled)
 

@@ -12,8 +12,13 @@ import numpy as np
 from probewise import nested
 from probewise._arrays import FloatArray, own_arithmetic
 from probewise._display import Reported
-from probewise._kinds import require_kind, require_progress, require_rng
-from probewise.diagnosis.diagnose_simulator import modes_of, notes_on_declared_noise, prepare_system
+from probewise._kinds import require_flag, require_kind, require_progress, require_rng
+from probewise.diagnosis.diagnose_simulator import (
+    modes_of,
+    notes_on_declared_noise,
+    notes_on_predictions,
+    prepare_system,
+)
 from probewise.diagnosis.diagnosis import Diagnosis
 from probewise.diagnosis.evidence import NUMBERS, laplace_evidence, log_evidence_of
 from probewise.diagnosis.fit import Fit, Model, fit_each_start
@@ -197,10 +202,11 @@ def fit_simulator(
     """
     table = table_for(simulator, table)
     require_rng(rng)
+    require_flag("thorough", thorough)
     require_progress(progress)
     prepared = prepare_system(simulator, table, source=source, notes=notes, progress=progress, with_effects=False)
-    recording, about = prepared.recording, cast(SimulatorApparatus, prepared.apparatus).about
-    system = about.system
+    recording, apparatus = prepared.recording, cast(SimulatorApparatus, prepared.apparatus)
+    about, system = apparatus.about, apparatus.system
     usable = recording.usable
     require(not prepared.has_only_equal_readings, "readings", "all equal", "readings of which some differ")
     progress("looking for the modes")
@@ -226,6 +232,7 @@ def fit_simulator(
         noise_sd = draw_noise_sd(likeliest, recording.readings[usable] - predicted[:, usable], rng=rng)
     samples = ModelSamples(system.chain(recording.plan, ()), system.theta(z), noise_sd, 0)
     said = [*note_on_improbable_rows(fits[0], recording), *notes_on_declared_noise(simulator, noise_sd)]
+    said += notes_on_predictions(apparatus)
     said += _doubts(problem, draws, modes[0], n_even, is_settled=is_settled)
     recording = replace(recording, notes=(*recording.notes, *said))
     mean = predicted.mean(axis=0)

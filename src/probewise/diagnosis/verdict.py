@@ -121,7 +121,7 @@ class Hypothesis:
         return combination_label(self.effects)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Judged:
     """The verdict on a recording, with probabilities.
 

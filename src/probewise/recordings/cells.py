@@ -245,11 +245,15 @@ def times_to_numbers(name: str, values: ArrayLike, unit: str = "s") -> tuple[Arr
         return values, ""
     try:
         if array.dtype.kind in "mM" and not np.isnat(array).any():
+            if array.dtype.kind == "M" and np.datetime_data(array.dtype)[0] in "YM":
+                array = array.astype("M8[D]")
             seconds = np.asarray((array - array[:1]) / np.timedelta64(1, "s"), dtype=np.float64)
             return _in_unit(name, seconds, str(array[0]), unit)
         if all(isinstance(cell, datetime.datetime) for cell in cells):
             if len({cell.utcoffset() is None for cell in cells}) > 1:
                 raise ParameterError(name, values, "dates that all have a time zone, or none of them")
+            if cells[0].tzinfo is not None:  # Python subtracts what clocks of one zone show, also across summer time
+                cells = [cell.astimezone(datetime.UTC) for cell in cells]
         elif not all(isinstance(cell, datetime.timedelta) for cell in cells):
             read = None
             if isinstance(cells[0], str | datetime.date | datetime.time):

@@ -22,7 +22,13 @@ from probewise._arrays import (
     rounding_error,
 )
 from probewise._display import ShowsItself
-from probewise._kinds import checked_finite_number, checked_whole, require_kind, warn_of_likely_degrees
+from probewise._kinds import (
+    checked_finite_number,
+    checked_whole,
+    require_kind,
+    require_plain_text,
+    warn_of_likely_degrees,
+)
 from probewise._words import unit_after_number
 from probewise.errors import ParameterError, ShapeError, require
 from probewise.recordings.cells import times_to_numbers
@@ -65,8 +71,9 @@ class Instrumentation:
     description: str = ""
 
     def __post_init__(self) -> None:
-        for name in ("unit", "sensor", "description"):
-            require_kind(name, getattr(self, name), str, "a text")
+        for name in ("unit", "sensor"):
+            require_plain_text(name, getattr(self, name))
+        require_kind("description", self.description, str, "a text")
         for name in ("min", "max", "step", "height_mm"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, checked_finite_number(name, getattr(self, name), "a number or None"))

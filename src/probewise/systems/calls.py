@@ -97,9 +97,12 @@ class Caller:
     n_failed: int = 0
     interpolated: set[str] = field(default_factory=set)
     cut_short: bool = False
-    on_call: Callable[[], None] = lambda: None
+    on_call: Callable[[], None] | None = None
     _known: dict[bytes, FloatArray] = field(default_factory=dict, repr=False)
     _taken_together: dict[frozenset[str], bool] = field(default_factory=dict, repr=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "on_call": None}  # progress is of this process
 
     @classmethod
     def from_trial_calls(
@@ -255,7 +258,8 @@ class Caller:
 
     def _count_call(self) -> None:
         self.n_calls += 1
-        self.on_call()
+        if self.on_call is not None:
+            self.on_call()
 
     def _interpolation(self, own: Values, n_points: int) -> Iterator[tuple[FloatArray | None, Values]]:
         """Yield each share, by Lagrange, in the readings of a sample, None of a single call, and the call's values."""
@@ -312,25 +316,24 @@ def _readings_or_none(path: Path, given: tuple[Values, Values]) -> FloatArray | 
 def _digest_of_arguments(own: Values, columns: Columns) -> bytes:
     digest = hashlib.blake2b(digest_size=16)
     for name, values in (*own.items(), *columns.items()):
-        digest.update(name.encode())
+        digest.update(name.encode(errors="surrogatepass"))
         digest.update(np.ascontiguousarray(values).tobytes())
     return digest.digest()
 
 
-class ProgressWithCallCount:
-    """A progress function that adds the number of calls of `simulate` to each stage, updated at every call."""
+def progress_with_call_count(progress: Progress, caller: Caller | None) -> Progress:
+    """Return a progress function that adds the number of calls of `simulate`, if any, at every stage and every call."""
+    if caller is None:
+        return progress
+    now: list[Any] = ["calling simulate", 0, 0, ""]
+    of = "" if caller.broadcasts else f" of about {MOST_CALLS:,}"
 
-    def __init__(self, progress: Progress, caller: Caller) -> None:
-        self._progress, self._caller = progress, caller
-        self._now = ("calling simulate", 0, 0, "")
-        caller.on_call = lambda: self(*self._now)
+    def report(stage: str, done: int = 0, total: int = 0, note: str = "") -> None:
+        now[:] = stage, done, total, note
+        progress(stage, done, total, f"{note}, " * bool(note) + f"{caller.n_calls:,}{of} calls of simulate")
 
-    def __call__(self, stage: str, done: int = 0, total: int = 0, note: str = "") -> None:
-        """Report the progress of a stage."""
-        self._now = stage, done, total, note
-        most = "" if self._caller.broadcasts else f" of about {MOST_CALLS:,}"
-        calls = f"{self._caller.n_calls:,}{most} calls of simulate"
-        self._progress(stage, done, total, f"{note}, {calls}" if note else calls)
+    caller.on_call = lambda: report(*now)
+    return report
 
 
 def number_of_samples(*values: Values) -> int:

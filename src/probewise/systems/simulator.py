@@ -19,9 +19,11 @@ from probewise._kinds import (
     checked_text,
     checked_texts,
     require_callable,
+    require_flag,
     require_kind,
     require_mapping,
     require_one_of,
+    require_plain_text,
 )
 from probewise.effects import EFFECTS, RARE_EFFECTS
 from probewise.errors import FileError, ParameterError, message_of, printable, require, shown
@@ -30,9 +32,9 @@ from probewise.recordings.io import raising_exceptions, read_text, run_python_te
 from probewise.sensor import Stage
 from probewise.systems.table import RunTable, median_sd_of_column, read_run_table
 
-_OF_SYSTEM = ("reading", "unit", "time", "time_unit", "run", "parameters", "per_run", "controls", "noise")
+_OF_SYSTEM = ("reading", "unit", "time", "time_unit", "run", "parameters", "per_run", "controls", "noise", "vectorized")
 _OF_LAW = ("states", "hold", "max_step_s")
-_NAMES = (*_OF_SYSTEM, "simulate", *_OF_LAW, "rates", "observe", "vectorized", "extra")  # in a file
+_NAMES = (*_OF_SYSTEM, "simulate", *_OF_LAW, "rates", "observe", "extra")  # in a file
 
 Values: TypeAlias = Mapping[str, Any]
 """Parameters by name: floats, or arrays that broadcast against the rows."""
@@ -193,7 +195,8 @@ class Simulator:
         allowed = f"one of them: {from_python}; in a file {in_a_file}"
         require((self.simulate is None) != (self.law is None), "simulate, rates", found, allowed)
         checked_text("reading", self.reading, 'the name of the column that is predicted: reading = "..."')
-        require_kind("unit", self.unit, str, 'a text: unit = "..."')
+        require_plain_text("unit", self.unit, 'a text: unit = "..."')
+        require_flag("vectorized", self.vectorized)
         checked_text("time_unit", self.time_unit, 'a text, such as "min"')
         known = {self.reading: "the reading"}
         for name, column in (("time", self.time), ("run", self.run)):
@@ -298,8 +301,8 @@ def run_simulator_text(text: str, path: Path) -> Simulator:
             is_whole = isinstance(own, Mapping) and own.keys() == {"prior", "null", "says"}
             require(is_whole, f"extra[{name!r}]", own, 'a dict with "prior", "null" and "says"')
             effects[name] = Extra(own["prior"], float(own["null"]), str(own["says"]))
-        given |= {"vectorized": bool(said.get("vectorized", False)), "source": printable(path.name)}
-        return Simulator(simulate=simulate, law=law, extra=effects, fingerprint=fingerprint_of_text(text), **given)
+        given |= {"source": printable(path.name), "fingerprint": fingerprint_of_text(text)}
+        return Simulator(simulate=simulate, law=law, extra=effects, **given)
     except ParameterError as error:
         found = f"{error.name} is {shown(error.value)}" if error.value is not None else f"{error.name} is missing"
         like = get_close_matches(error.name, said.keys() - set(_NAMES), 1) if error.value is None else []

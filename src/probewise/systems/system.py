@@ -107,7 +107,7 @@ class System:
         settable = ", ".join(name for name in table.columns if name not in taken) or "this table has none"
         for name in simulator.controls:
             allowed = f"a column that the table has and that can be set: {settable}"
-            require(name in table.columns, "controls", name, allowed)
+            require(name in table.columns and name not in taken, "controls", name, allowed)
         columns, allowed = columns_without_reading(simulator, table), "a column besides the reading, such as the time"
         require(columns, "columns", list(table.columns), f"{allowed} or the number of each row")
         bare = cls(simulator, table.scan_names)

@@ -379,7 +379,7 @@ def run_table_csv(table: RunTable) -> str:
 
 def table_digest(table: RunTable) -> str:
     """Return the fingerprint of a table, by which a fitted simulator knows its recording."""
-    return hashlib.sha256(run_table_csv(table).encode()).hexdigest()[:16]
+    return hashlib.sha256(run_table_csv(table).encode(errors="surrogatepass")).hexdigest()[:16]
 
 
 def concatenate_tables(tables: Sequence[RunTable], sources: Sequence[str]) -> tuple[RunTable, tuple[str, ...]]:

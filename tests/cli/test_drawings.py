@@ -15,6 +15,7 @@ from probewise.cli import main
 from probewise.errors import FileError, NotDrawnError
 from probewise.proof import concealed_study
 from probewise.report.html import figure
+from probewise.report.plots.canvas import axes_of_frame
 from probewise.systems import run_table_csv
 
 DIAGNOSIS = ("diagnosis.json", "sensor.json", "calibrated.json", "report.html")
@@ -77,6 +78,7 @@ def test_a_command_that_cannot_draw_writes_the_rest_says_so_in_a_line_and_exits_
 
     monkeypatch.setattr(FigureCanvasAgg, "draw", fail)
     monkeypatch.setattr(FigureCanvasSVG, "print_svg", fail)
+    axes_of_frame.cache_clear()  # with what an earlier test drew once for all frames
     monkeypatch.setattr("webbrowser.open", lambda url: None)
     (tmp_path / "heater.py").write_text(FILE)
     (tmp_path / "data.csv").write_text(run_table_csv(runs(rng=np.random.default_rng(2))))

@@ -74,7 +74,6 @@ def test_a_legend_beside_long_names_below_it_is_whole_and_ticks_stand_apart():
     shifted = mean_residuals(X - 5.006, np.sin(X), 0.1 * np.sin(X), sd=1.0)
     plots.mean_residuals_along(shifted, label="dq", unit="Nm", window=(-1.0, 1.0), ax=axes[0])
     plots.hypothesis_probabilities(["another height of the sensor above the surface in some scans"], [1.0], ax=axes[1])
-    canvas.fit_to_room(axes[0])
     assert plots.svg(axes)
     sheet, ax = axes[0].figure, axes[0]
     assert ax.get_legend().get_window_extent().x1 <= sheet.bbox.x1

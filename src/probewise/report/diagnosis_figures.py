@@ -26,7 +26,7 @@ from probewise.report.covariates import (
     views_of_place,
 )
 from probewise.report.plots import residuals as plots
-from probewise.report.plots.canvas import BLUE, FILLED, AxesGrid, fit_to_room, stack_of_axes, svg
+from probewise.report.plots.canvas import BLUE, FILLED, AxesGrid, stack_of_axes, svg
 from probewise.report.plots.probabilities import height_of_bars_in, hypothesis_probabilities
 from probewise.systems import RunTable
 
@@ -81,7 +81,8 @@ def draw_first_figure(chance: ResidualNoise) -> AxesGrid:
     diagnosis = chance.diagnosis
     listed = [h for h in diagnosis.hypotheses if h.probability > _WORTH_A_BAR]
     names, most = [hypothesis_in_words(h.effects) for h in listed], min(len(listed), _MOST_BARS)
-    axes = stack_of_axes([2.7, height_of_bars_in([*names[:most], *["others"] * (len(diagnosis.hypotheses) > most)])])
+    bars = [*names[:most], *["others"] * (len(diagnosis.hypotheses) > most)]
+    axes = stack_of_axes([2.7, height_of_bars_in(bars)], aligned=False)
     above, below = axes
     shown = first_figure_content(diagnosis, chance)
     if shown == "readings":
@@ -94,7 +95,6 @@ def draw_first_figure(chance: ResidualNoise) -> AxesGrid:
     names += [""] * (len(diagnosis.hypotheses) - len(listed))
     probabilities = [h.probability for h in (*listed, *diagnosis.hypotheses[len(listed) :])]
     hypothesis_probabilities(names, probabilities, most=most, ax=below)
-    fit_to_room(above)
     return axes
 
 

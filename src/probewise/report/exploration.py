@@ -31,6 +31,7 @@ from probewise.experiment import (
 from probewise.experiment.result import WRONG_MM, stop_reason_with_checks
 from probewise.report import html
 from probewise.report.plots.canvas import PAGE_IN, AxesGrid, axes_of_frame, grid_of_axes, png
+from probewise.report.plots.canvas import frame_png as render_frame
 from probewise.report.plots.probabilities import effect_probabilities_by_reading
 from probewise.report.plots.search import draw_field_legend, information_gained, playing_field, posterior_widths
 from probewise.report.words import (
@@ -47,6 +48,7 @@ from probewise.verbs import DEFAULT_SEED
 
 MODEL_NAMES = {"ssf": "SSF"}
 _COLOURS = 256  # of a GIF
+_ROUNDED = 5  # a divisor of 255, to which colours are rounded where the palette is chosen: it takes a third of the time
 _FRAME_S, _LAST_S = 0.8, 3.0
 _LEAST_SHOWN = 1e-3  # probability of an effect, to be listed in the table
 _MOST_SHOWN = 6
@@ -98,7 +100,7 @@ def robot_view_png(
     ax = axes_of_frame()
     draw_robot_view(step, experiment, readings, levels=levels, truth_mm=truth_mm, ax=ax)
     draw_field_legend(ax)
-    return png(ax, dpi=90, tight=False)
+    return render_frame(ax)
 
 
 def draw_view_after(run: Exploration, number: int, *, title: str = "", ax: Axes | None = None) -> Axes:
@@ -206,9 +208,10 @@ def _common_palette(sheets: Sequence[Image.Image]) -> Image.Image:
 
     The palette covers the range of colours, whatever their frequency, so that small squares keep their rare colours.
     """
-    weights = np.array([1 << 16, 1 << 8, 1], dtype=np.uint32)
-    codes = np.unique(np.concatenate([np.unique(np.asarray(sheet) @ weights) for sheet in sheets]))
-    colours = np.stack([codes >> 16, codes >> 8 & 255, codes & 255], axis=-1).astype(np.uint8)
+    seen = [np.array([colour for _, colour in sheet.getcolors(sheet.width * sheet.height) or []]) for sheet in sheets]
+    levels = (255 // _ROUNDED + 1,) * 3
+    codes = np.unique(np.ravel_multi_index(np.rint(np.concatenate(seen).T / _ROUNDED).astype(np.int64), levels))
+    colours = (_ROUNDED * np.stack(np.unravel_index(codes, levels), axis=-1)).astype(np.uint8)
     return Image.fromarray(colours[None]).quantize(_COLOURS, method=Image.Quantize.MAXCOVERAGE)
 
 

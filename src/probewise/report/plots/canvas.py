@@ -8,27 +8,31 @@ from __future__ import annotations
 
 import contextlib
 import io
+import itertools
 import re
 import textwrap
 from collections.abc import Iterator, Sequence
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import Any, Literal, TypeAlias, cast
-from weakref import WeakSet
+from weakref import WeakKeyDictionary, WeakSet
 
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, LinearSegmentedColormap
 from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties, findfont, get_font
 from matplotlib.image import AxesImage
 from matplotlib.layout_engine import LayoutEngine
+from matplotlib.legend import Legend
 from matplotlib.patches import Rectangle
 from matplotlib.text import Text
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import LogLocator, NullFormatter
 from numpy.typing import NDArray
 from PIL import Image, ImageChops, ImageOps
 
@@ -49,19 +53,19 @@ FILLED: dict[str, Any] = {"color": BLUE, "alpha": 0.25, "linewidth": 0}
 TITLE: dict[str, Any] = {"fontsize": "medium", "loc": "left", "y": 1.0}
 """Style of a title. Without `y`, each drawing measures the tick labels of both axes, to place the title above them."""
 
-_TICK_IN = 0.8  # width of a tick with its label, of six digits
-_LINE_SAMPLE = 6  # letters that the sample of the line or colour before a label takes
+_MOST_STEPS = 6  # along the x axis: a tick and its label take a hundredth of a figure's time each
 _AXES = "axes of matplotlib: figure.add_subplot(), figure.subplots(), or None for a figure of its own"
 _MARGIN_IN = 0.1  # about a cropped picture, as matplotlib leaves it
+_PAD_IN = 0.05  # between axes, and around a label
+_TICK_IN = 0.1  # of a tick and the gap before its label
+_LINE, _NEXT_LINE = 1.2, 1.4  # height of one line, and of each that follows, in sizes of its font
+_BAR_ENDS = 0.037  # of the width of axes, right of which their colour bar ends
 _EMPTY_BRACKETS = re.compile(r"\s*\(\)$")
 
 AxesGrid: TypeAlias = NDArray[Any]
 
 PAGE_IN, PANEL_IN = 9.6, 6.8
 """Width of a report's column: a wider drawing is shrunk, and its text with it; width of a drawing of one column."""
-
-LETTERS_PER_IN = 16.2
-"""Letters in an inch of the smallest font, about."""
 
 SMALL_PT = 9.0
 """The smallest font size of any drawing: 8.5 pt or more on a page."""
@@ -70,6 +74,10 @@ OUT_OF_REACH = "#d9d9d9"
 """Colour of places out of the arm's reach, in every drawing of the field."""
 
 _OPENED: WeakSet[Figure] = WeakSet()  # figures that plot functions opened: `png` closes them, and no others
+_STILL: WeakKeyDictionary[Figure, tuple[Any, Any, Any]] = (
+    WeakKeyDictionary()
+)  # canvas of frames, what stays, and of what
+_COLUMNS: WeakKeyDictionary[Legend, int] = WeakKeyDictionary()  # of legends above axes, or below all of a figure
 
 # The paper's copper tones. They start above black, so that black squares and blue outlines stay visible, and lightness
 # rises evenly, so that the map can be read in grey too.
@@ -85,30 +93,160 @@ def axes_or_new(ax: Axes | None, *, size_in: tuple[float, float] = (PANEL_IN, 2.
     return ax if ax is not None else grid_of_axes(1, 1, size_in=size_in)[0, 0]
 
 
-def grid_of_axes(n_rows: int, n_columns: int, *, size_in: tuple[float, float], **options: Any) -> AxesGrid:
+def grid_of_axes(
+    n_rows: int, n_columns: int, *, size_in: tuple[float, float], aligned: bool = True, **options: Any
+) -> AxesGrid:
     """Open a pyplot figure, which `png` or `svg` will close; return its axes, (n_rows, n_columns).
 
-    The options go to `Figure.subplots`.
+    `aligned` is that of `Margins`; the other options go to `Figure.subplots`.
     """
-    sheet = plt.figure(figsize=size_in, layout="constrained")
+    sheet = plt.figure(figsize=size_in, layout=Margins(aligned=aligned))
     _OPENED.add(sheet)
-    return np.asarray(sheet.subplots(n_rows, n_columns, squeeze=False, **options), dtype=np.object_)
+    axes: AxesGrid = np.asarray(sheet.subplots(n_rows, n_columns, squeeze=False, **options), dtype=np.object_)
+    for ax in axes.flat:
+        ax.xaxis.get_major_locator().set_params(nbins=_MOST_STEPS)
+    return axes
 
 
-def stack_of_axes(heights_in: Sequence[float]) -> AxesGrid:
-    """Open a figure and return its axes of these heights, one above the other, (n_axes,)."""
+def stack_of_axes(heights_in: Sequence[float], *, aligned: bool = True) -> AxesGrid:
+    """Open a figure and return its axes of these heights, one above the other, (n_axes,); `aligned` as in `Margins`."""
     size_in = (PANEL_IN, sum(heights_in))
-    return grid_of_axes(len(heights_in), 1, size_in=size_in, height_ratios=list(heights_in))[:, 0]
+    return grid_of_axes(len(heights_in), 1, size_in=size_in, aligned=aligned, height_ratios=list(heights_in))[:, 0]
+
+
+class Margins(LayoutEngine):
+    """Places the axes of a grid before a figure is drawn, with margins for the texts about them.
+
+    The room of a text is known by the widths of its letters: constrained layout draws a figure twice to measure it.
+    Each row has one margin above and one below, each column one on either side; unless `aligned`, where there is one
+    column, all axes have their own.
+    """
+
+    _adjust_compatible = _colorbar_gridspec = False
+
+    def __init__(self, *, aligned: bool = True) -> None:
+        super().__init__()
+        self._aligned = aligned
+
+    def execute(self, fig: Figure) -> None:
+        """Place the axes, then again with the ticks and legends that fit there."""
+        for _ in range(2):
+            _place_axes(fig, aligned=self._aligned)
+
+
+def _place_axes(sheet: Figure, *, aligned: bool) -> None:
+    cells = [(ax, spec) for ax in sheet.axes if (spec := ax.get_subplotspec()) is not None]
+    grid = cells[0][1].get_gridspec()
+    left, right, below, above = sides = [np.zeros(n) for n in (grid.ncols, grid.ncols, grid.nrows, grid.nrows)]
+    for ax, spec in cells:
+        column, row = spec.colspan.start, spec.rowspan.start
+        for side, place, room in zip(sides, (column, column, row, row), _rooms_about_in(ax), strict=True):
+            side[place] = max(side[place], room)
+    head = sum(_size_in(text)[1] + _PAD_IN for text in sheet.texts)
+    foot = sum(map(_legend_height_in, sheet.legends))
+    size, taken = sheet.get_size_inches(), [(left + right).sum(), (above + below).sum() + head + foot]
+    ratios = grid.get_width_ratios() or [1.0] * grid.ncols, grid.get_height_ratios() or [1.0] * grid.nrows
+    shares = [np.array(each) / np.sum(each) for each in ratios]
+    widths, heights = (max(n - t, 0.2 * n) * share for n, t, share in zip(size, taken, shares, strict=True))
+    for ax, spec in cells:
+        column, row = spec.colspan.start, spec.rowspan.start
+        if not aligned:
+            (left[0], right[0], *_) = _rooms_about_in(ax)
+            widths[0] = size[0] - left[0] - right[0]
+        x = left[: column + 1].sum() + (right + widths)[:column].sum()
+        y = size[1] - head - (above + heights)[: row + 1].sum() - below[:row].sum()
+        ax.set_position((x / size[0], y / size[1], widths[column] / size[0], heights[row] / size[1]))
+        ax.set_in_layout(True)
+        if (legend := ax.get_legend()) is not None and legend in _COLUMNS:
+            legend_above(ax, title=legend.get_title().get_text())
+
+
+def _rooms_about_in(ax: Axes) -> tuple[float, float, float, float]:
+    """Return the room that the texts of axes need on the left, on the right, below and above, in inches."""
+    if not ax.get_visible():
+        return 0.0, 0.0, 0.0, 0.0
+    right = max((_size_in(text)[0] for text in ax.get_xticklabels()), default=0.0) / 2
+    for bar in ax.child_axes:
+        right = _BAR_ENDS * ax.get_position().width * figure_of(ax).get_figwidth() + _axis_room_in(bar.yaxis, 0)
+    titles = [ax.get_title(), ax.get_title("left"), ax.yaxis.get_offset_text().get_text()]
+    above = [_height_in(text, mpl.rcParams["font.size"]) + _PAD_IN for text in titles if text]
+    above.append(_legend_height_in(ax.get_legend()))
+    return _axis_room_in(ax.yaxis, 0), right + _PAD_IN, _axis_room_in(ax.xaxis, 1), max(above) + _PAD_IN
+
+
+def _axis_room_in(axis: Axis, side: int) -> float:
+    """Return the width (`side` 0) or height (1) of an axis's ticks, of their labels and of its own."""
+    ticks = max((_size_in(text)[side] for text in axis.get_majorticklabels()), default=0.0)
+    label = _size_in(axis.label)[side]
+    return (ticks + _TICK_IN if ticks else 0.0) + (label + _PAD_IN if label else 0.0) + _PAD_IN
+
+
+def _legend_height_in(legend: Legend | None) -> float:
+    """Return the height of a legend above axes, or below all of them; 0 for another."""
+    if legend is None or legend not in _COLUMNS:
+        return 0.0
+    heights = np.array([_size_in(text)[1] + 0.5 * SMALL_PT / 72 for text in legend.get_texts()])
+    return max(map(sum, np.array_split(heights, _COLUMNS[legend]))) + _size_in(legend.get_title())[1] + _PAD_IN
+
+
+def _size_in(text: Text) -> tuple[float, float]:
+    """Return the width and the height of a text, (0, 0) if nothing is shown."""
+    if not text.get_visible() or not text.get_text():
+        return 0.0, 0.0
+    size, turn = float(text.get_fontsize()), np.radians(text.get_rotation())
+    wide, high = _width_in(text.get_text(), size), _height_in(text.get_text(), size)
+    across, along = abs(np.cos(turn)), abs(np.sin(turn))
+    return wide * across + high * along, wide * along + high * across
+
+
+def _height_in(text: str, size_pt: float) -> float:
+    return size_pt / 72 * (_LINE + _NEXT_LINE * text.count("\n"))
+
+
+def _width_in(text: str, size_pt: float = SMALL_PT) -> float:
+    """Return the width of a text's longest line; 5 % more than by its letters, as hinted ones are wider."""
+    return 1.05 * size_pt / 72 * max(sum(map(_letter_em, line)) for line in text.split("\n"))
+
+
+@cache
+def _letter_em(letter: str) -> float:
+    """Return the width of a letter of the default font, in units of the font's size."""
+    font = get_font(findfont(FontProperties()))
+    font.set_size(10, 72)
+    return font.load_char(ord(letter)).linearHoriAdvance / 655360
 
 
 @lru_cache(maxsize=1)
 def axes_of_frame() -> Axes:
     """Return the axes of an animation's frames, the same for each, with room for colour bar and legend.
 
-    Who draws a frame replaces what was drawn before: new axes, with new ticks, take most of the time of a frame, and a
-    layout that measures the labels as long again.
+    Who draws a frame replaces what was drawn before: new axes, with new ticks, take most of the time of a frame.
     """
-    return Figure((8.4, 4.7)).add_axes((0.09, 0.24, 0.77, 0.69))
+    return Figure((8.4, 4.7), dpi=90).add_axes((0.09, 0.24, 0.77, 0.69))
+
+
+def frame_png(ax: Axes) -> bytes:
+    """Render the axes of a frame as PNG; both axis labels with their ticks, and the legend, are drawn once for all."""
+    sheet, inside = figure_of(ax), (ax.images, ax.collections, ax.lines, ax.patches, ax.spines.values(), ax.child_axes)
+    (title,) = (text for text in ax.get_children() if isinstance(text, Text) and text.get_text())
+    moving = sorted([title, *itertools.chain(*inside)], key=lambda artist: artist.get_zorder())
+    labels = [text.get_text() for legend in sheet.legends for text in legend.get_texts()]
+    still = [*labels, *ax.get_xlim(), *ax.get_ylim()]
+    agg, region, drawn = _STILL.get(sheet, (FigureCanvasAgg(sheet), None, None))
+    if drawn != still:
+        try:
+            for artist in moving:
+                artist.set_visible(False)
+            with text_as_it_is(sheet):
+                agg.draw()
+        finally:
+            for artist in moving:
+                artist.set_visible(True)
+        _STILL[sheet] = agg, region, _ = agg, agg.copy_from_bbox(sheet.bbox), still
+    agg.restore_region(region)
+    for artist in moving:
+        artist.draw(agg.get_renderer())
+    return _png_of(agg, sheet.dpi, tight=False)
 
 
 def figure_of(drawing: Axes | AxesGrid | Figure) -> Figure:
@@ -133,7 +271,7 @@ def png(drawing: Axes | AxesGrid | Figure, *, dpi: int = 110, tight: bool = True
 
     `tight` crops empty margins. Without it, figures of equal size give PNGs of equal size, as an animation needs.
     """
-    sheet, buffer = figure_of(drawing), io.BytesIO()
+    sheet = figure_of(drawing)
     own, own_dpi = sheet.canvas, sheet.dpi
     agg: Any = FigureCanvasAgg(sheet)  # `savefig` would draw everything twice, and measure it a third time
     sheet.dpi = dpi
@@ -145,7 +283,11 @@ def png(drawing: Axes | AxesGrid | Figure, *, dpi: int = 110, tight: bool = True
         sheet.dpi = own_dpi
     if sheet in _OPENED:
         plt.close(sheet)
-    picture = Image.fromarray(np.asarray(agg.buffer_rgba())).convert("RGB")
+    return _png_of(agg, dpi, tight=tight)
+
+
+def _png_of(agg: FigureCanvasAgg, dpi: float, *, tight: bool) -> bytes:
+    picture, buffer = Image.fromarray(np.asarray(cast(Any, agg).buffer_rgba())).convert("RGB"), io.BytesIO()
     if tight and (inked := ImageChops.invert(picture).getbbox()) is not None:
         margin = round(_MARGIN_IN * dpi)
         picture = ImageOps.expand(picture.crop(inked), margin, "white")
@@ -170,23 +312,17 @@ def legend_above(ax: Axes, *, title: str = "") -> None:
     handles, labels = ax.get_legend_handles_labels()
     if not labels:
         return
-    room = LETTERS_PER_IN * ax.get_position().width * figure_of(ax).get_figwidth()
-    labels = [textwrap.fill(label, max(int(room) - _LINE_SAMPLE, 1)) for label in labels]
-    widest = max(len(line) for label in labels for line in label.split("\n")) + _LINE_SAMPLE
+    room, em = ax.get_position().width * figure_of(ax).get_figwidth(), SMALL_PT / 72
+    labels = [textwrap.fill(t, max(int(len(t) * (room - 2.8 * em) / _width_in(t)), 1)) for t in labels]
+    widths = [_width_in(label) + 4.8 * em for label in labels]  # of the line before it and the gap after it, too
+    counts = range(len(labels), 1, -1)
+    columns = next((n for n in counts if sum(map(max, np.array_split(widths, n))) <= room + 2 * em), 1)
+    earlier = ax.get_legend()
+    if earlier and (columns, labels) == (_COLUMNS.get(earlier), [text.get_text() for text in earlier.get_texts()]):
+        return
     style: dict[str, Any] = {"frameon": False, "fontsize": SMALL_PT, "title_fontsize": SMALL_PT, "alignment": "left"}
     place: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "borderaxespad": 0.1}
-    ax.legend(handles, labels, ncols=max(int(room / widest), 1), title=title or None, **place, **style)
-
-
-def fit_to_room(ax: Axes) -> None:
-    """Lay the figure out, and fit legend and ticks of some axes to the width that long labels of others leave them."""
-    sheet = figure_of(ax)
-    with text_as_it_is(sheet):
-        cast(LayoutEngine, sheet.get_layout_engine()).execute(sheet)
-    legend_above(ax)
-    if isinstance(ax.xaxis.get_major_locator(), MaxNLocator):
-        width_in = ax.get_position().width * sheet.get_figwidth()
-        ax.xaxis.set_major_locator(MaxNLocator(max(int(width_in / _TICK_IN), 2), steps=[1, 2, 2.5, 5, 10]))
+    _COLUMNS[ax.legend(handles, labels, ncols=columns, title=title or None, **place, **style)] = columns
 
 
 def legend_below(axes: Axes | AxesGrid, *, n_columns: int = 4, ground: str = "none", ink: str = BLACK) -> None:
@@ -197,18 +333,18 @@ def legend_below(axes: Axes | AxesGrid, *, n_columns: int = 4, ground: str = "no
     for earlier in [*sheet.legends]:
         earlier.remove()
     if handles:
-        sheet.legend(
-            list(handles.values()),
-            list(handles),
-            loc="outside lower center",
-            ncols=min(n_columns, len(handles)),
-            frameon=ground != "none",
-            facecolor=ground,
-            framealpha=1.0,
-            edgecolor="none",
-            labelcolor=ink,
-            fontsize=SMALL_PT,
-        )
+        style: dict[str, Any] = {"facecolor": ground, "framealpha": 1.0, "edgecolor": "none", "labelcolor": ink}
+        columns = min(n_columns, len(handles))
+        place: dict[str, Any] = {"loc": "lower center", "ncols": columns, "frameon": ground != "none"}
+        _COLUMNS[sheet.legend([*handles.values()], [*handles], fontsize=SMALL_PT, **place, **style)] = columns
+
+
+def use_log_scale(ax: Axes, *, ticks: Sequence[float]) -> None:
+    """Give axes a logarithmic y axis with plain numbers, of each decade these `ticks`; formulas take long to set."""
+    ax.set_yscale("log")
+    ax.yaxis.set_major_locator(LogLocator(subs=ticks))
+    ax.yaxis.set_major_formatter("{x:g}")
+    ax.yaxis.set_minor_formatter(NullFormatter())
 
 
 def label_axes(ax: Axes, *, x: str, y: str, title: str = "") -> Axes:

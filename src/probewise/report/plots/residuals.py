@@ -265,7 +265,7 @@ def residual_histogram(residuals: FloatArray, sd: float, *, ax: Axes | None = No
     at = np.linspace(-5, 5, 201)
     normal = len(z) * 0.5 * np.exp(-0.5 * at**2) / np.sqrt(2 * np.pi)
     ax.plot(at, normal, "--", color=canvas.BLACK, linewidth=1.4, label="normal distribution")
-    ax.set_yscale("log")
+    canvas.use_log_scale(ax, ticks=(1.0, 3.0))
     ax.set_ylim(0.5, 2 * max(float(counts.max(initial=1)), 1.0))
     return canvas.finish(ax, x="residual (sds of the noise)", y="readings per half sd", plain="x")
 

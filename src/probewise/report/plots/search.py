@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.patches import Polygon
-from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import MaxNLocator
 
 from probewise._arrays import FloatArray
 from probewise._words import count_with_noun
@@ -125,10 +125,7 @@ def posterior_widths(widths_mm: Mapping[str, FloatArray], *, target_mm: float = 
 def set_up_width_axes(ax: Axes, target_mm: float) -> Axes:
     """Label axes of posterior sds (log scale, mm) by number of readings, draw the target's line; return the axes."""
     ax.axhline(target_mm, color=canvas.BLACK, linestyle="--", label=f"target: {target_mm:g} mm")
-    ax.set_yscale("log")
-    ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    ax.yaxis.set_major_formatter("{x:g}")
-    ax.yaxis.set_minor_formatter(NullFormatter())
+    canvas.use_log_scale(ax, ticks=(1.0, 2.0, 5.0))
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     return canvas.label_axes(ax, x="number of readings", y="widest posterior sd (mm)")
 

@@ -26,6 +26,7 @@ __all__ = [
 ]
 
 _LONGEST_VALUE = 100  # characters of a bad value that a message shows
+_LONGEST_CAUSE = 200  # characters of another error's message
 _LONGEST_PART = 400  # characters of each part of a message
 
 
@@ -53,10 +54,10 @@ def shown(value: object, most: int = _LONGEST_VALUE) -> str:
     return shortened(text, most)
 
 
-def message_of(error: BaseException, most: int = 200, *, kind: bool = True) -> str:
+def message_of(error: BaseException, *, kind: bool = True) -> str:
     """Return an exception's kind, unless False, and its message on one line, cut where it is long; never fails."""
     try:
-        text = shortened(" ".join(str(error).split()), most)
+        text = shortened(" ".join(str(error).split()), _LONGEST_CAUSE)
     except BaseException as failure:  # of a user's own __str__
         if isinstance(failure, KeyboardInterrupt):
             raise

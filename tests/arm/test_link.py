@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from probewise.arm.nxt import BrickError, Link, NoAnswerError, TelegramError, Timing
+from probewise.arm.nxt import BrickError, Link, NoAnswerError, TelegramError
 from probewise.arm.nxt import telegram as t
+from probewise.arm.nxt.link import LONGEST_S
 from probewise.errors import LinkError
 
 ASLEEP, AWAKE = "02 00 00 0D", "07 00 02 0D 00 C0 27 09 00"
@@ -16,7 +17,6 @@ MOVE, MOVED = "0C 00 00 04 00 32 07 01 00 20 5A 00 00 00", "03 00 02 04 00"
 STATE = "03 00 00 06 00"
 RUNNING = "19 00 02 06 00 00 32 07 01 00 20 5A 00 00 00" + 12 * " 00"
 FENCE = (BATTERY, (0.06, VOLTS))
-LONGEST_S = Timing().longest_s
 
 read = t.get_input_values(1)
 move = t.set_output_state(0, 50, 7, 1, run_state=0x20, limit_counts=90)

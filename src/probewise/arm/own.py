@@ -63,7 +63,7 @@ class OwnInstrument:
         self._speed = Speed()
 
     @classmethod
-    def from_file(cls, path: str | Path, *, start_s: float = 0.0, clock: Clock = time) -> Self:
+    def from_file(cls, path: str | Path, *, start_s: float = 0.0) -> Self:
         """Load a user's file; its function `connect()`, which returns the instrument, is called on entering.
 
         Raises FileError if the file cannot be read or run, or has no function `connect`.
@@ -73,7 +73,7 @@ class OwnInstrument:
         if not callable(connect):
             found = "connect is missing" if connect is None else f"connect is a {type(connect).__name__}"
             raise FileError(path, found, "def connect(): ..., which returns an object with measure(pose)")
-        return cls(connect, source=str(path), start_s=start_s, clock=clock)
+        return cls(connect, source=str(path), start_s=start_s)
 
     def __enter__(self) -> Self:
         """Connect; an object without `measure` is closed and refused."""

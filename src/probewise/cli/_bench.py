@@ -37,7 +37,7 @@ from probewise.arm import (
 )
 from probewise.arm.nxt import Brick, BrickMachine, Link
 from probewise.cli._common import CommandError, print_result, print_warning, say, write_to_terminal
-from probewise.cli._options import ARMS, SCENE, parse_finite_numbers, refuse_options
+from probewise.cli._options import ARMS, SCENE, parse_finite_numbers, parse_place, refuse_options
 from probewise.errors import ParameterError, did_you_mean, require
 from probewise.verbs import DEFAULT_SEED
 
@@ -324,6 +324,14 @@ def without_measured_covariates(plan: recordings.Plan, instrumentation: recordin
     plan = dataclasses.replace(plan, instrumentation=instrumentation)
     can = {*plan.instrumentation.controls, "led", "height_mm"}
     return dataclasses.replace(plan, covariates={name: v for name, v in plan.covariates.items() if name in can})
+
+
+def origin_of_plan(arguments: argparse.Namespace, geometry: Geometry, *, is_own: bool) -> tuple[float, float]:
+    """Return where on the field a plan's origin lies: as --origin-mm says, else the middle of a LEGO arm's field."""
+    if arguments.origin_mm is not None:
+        return parse_place("--origin-mm", arguments.origin_mm)
+    width, height = (0.0, 0.0) if is_own else geometry.field_mm
+    return width / 2, height / 2
 
 
 # The person at the bench

@@ -404,8 +404,7 @@ def _record_plan(arguments: argparse.Namespace, geometry: Geometry) -> None:
     chosen = None if arguments.arm is None else _bench.parse_arm(arguments.arm)
     is_own = chosen is not None and chosen.kind == "file"
     plan = _plan_for_arm(arguments, geometry, is_own=is_own)
-    width, height = (0.0, 0.0) if is_own else geometry.field_mm
-    origin = (width / 2, height / 2) if arguments.origin_mm is None else parse_place("--origin-mm", arguments.origin_mm)
+    origin = _bench.origin_of_plan(arguments, geometry, is_own=is_own)
     at_end = is_device_or_pipe(out)  # which takes the recording once
     taken: list[Reading] = []
     if not arguments.dry_run and not at_end:

@@ -18,7 +18,7 @@ from probewise.calibration import read_sensor
 from probewise.cli import _bench as benches
 from probewise.cli._common import CommandError, finish, message_to_resume, progress_of, say
 from probewise.cli._inputs import read_or_shipped_geometry, read_or_shipped_plan, tables_and_descriptions
-from probewise.cli._options import SHIPPED, parse_place, refuse_options
+from probewise.cli._options import SHIPPED, refuse_options
 from probewise.errors import ParameterError
 from probewise.investigation import (
     Budget,
@@ -110,10 +110,7 @@ def _opened_plan_runner(
 ) -> Iterator[Take]:
     """Open an arm; yield the function that takes a plan's readings with it. A person or the bench lays the sheets."""
     geometry = read_or_shipped_geometry(arguments)
-    width, height = (0.0, 0.0) if chosen.kind == "file" else geometry.field_mm
-    origin = (width / 2, height / 2)
-    if arguments.origin_mm is not None:
-        origin = parse_place("--origin-mm", arguments.origin_mm)
+    origin = benches.origin_of_plan(arguments, geometry, is_own=chosen.kind == "file")
     opened, bench = benches.open_arm(
         chosen, geometry, arguments.geometry, seed=seed, start_s=folder.last_time_s, n_taken=folder.n_readings
     )

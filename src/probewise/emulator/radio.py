@@ -101,7 +101,7 @@ def ignore_trace(now_s: float, event: Event, text: str) -> None:
 class Radio:
     """A Bluetooth link to a brick, as its host sees it; `rng` draws the faults, `mishaps` counts each.
 
-    `faults` may be replaced at any time. `turnaround_s` is the time from the end of a request to its reply.
+    `faults` may be replaced at any time.
     """
 
     def __init__(
@@ -111,13 +111,11 @@ class Radio:
         *,
         rng: np.random.Generator,
         faults: Faults | None = None,
-        turnaround_s: float = _TURNAROUND_S,
         trace: Trace = ignore_trace,
     ) -> None:
         self.brick, self._clock, self._rng, self._trace = brick, clock, rng, trace
         self.faults = Faults() if faults is None else faults
         self.mishaps: Counter[str] = Counter()
-        self._turnaround_s = turnaround_s
         self.reconnect()
 
     def reconnect(self) -> None:
@@ -165,7 +163,7 @@ class Radio:
         if answer is None or self._fault_occurs("silence", self.faults.silence):
             return
         self._trace_telegram("<", answer)
-        at_s = self._clock() + self._turnaround_s
+        at_s = self._clock() + _TURNAROUND_S
         if self._fault_occurs("unasked", self.faults.unasked):
             self._schedule_delivery(at_s, protocol.framed(_UNASKED))
         if self._fault_occurs("late", self.faults.late):

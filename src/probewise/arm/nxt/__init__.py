@@ -12,7 +12,7 @@ from probewise.arm.nxt.brick import (
     normalized_from_counts,
     percent_from_counts,
 )
-from probewise.arm.nxt.link import Link, NoAnswerError, SerialPort, Timing
+from probewise.arm.nxt.link import Link, NoAnswerError, SerialPort
 from probewise.arm.nxt.motor import DriveParameters, Motor, MotorError
 from probewise.arm.nxt.telegram import BrickError, Reply, TelegramError, decode, encode, framed
 
@@ -30,7 +30,6 @@ __all__ = [
     "SensorError",
     "SerialPort",
     "TelegramError",
-    "Timing",
     "decode",
     "encode",
     "framed",

@@ -18,11 +18,12 @@ from probewise.arm.geometry import ROOM_COUNTS, Geometry, SoftLimits
 from probewise.arm.instrument import Clock, Side
 from probewise.arm.nxt import telegram as nxt
 from probewise.arm.nxt.link import Link, SerialPort
-from probewise.arm.nxt.motor import DriveParameters, Guard, Motor
+from probewise.arm.nxt.motor import Guard, Motor
 from probewise.errors import LinkError, LowBatteryWarning, require
 
 AD_MAX = 1023
 N_INVALID = 3  # least number of attempts, since one may use up the allowed time on a slow connection
+_VALID_S = 1.0
 _BRIGHT_COUNTS = 200  # 800 mV of 5000 mV in the firmware's integer arithmetic: 5 V is 1023 counts
 _SPAN_PERCENT = 68  # share of the converter's range between bright and dark, in percent
 
@@ -49,11 +50,11 @@ def percent_from_counts(raw_counts: int) -> float:
 class LightSensor:
     """A light sensor at one of the brick's inputs, 0 to 3 for 1 to 4, read in RAW mode: A/D counts.
 
-    While the brick marks a reading as invalid, the read is repeated for `valid_s`, three times at least.
+    While the brick marks a reading as invalid, the read is repeated for a second, three times at least.
     """
 
-    def __init__(self, link: Link, port: int, *, clock: Clock = time, valid_s: float = 1.0) -> None:
-        self._link, self.port, self._clock, self._valid_s = link, port, clock, valid_s
+    def __init__(self, link: Link, port: int, *, clock: Clock = time) -> None:
+        self._link, self.port, self._clock = link, port, clock
         self._type: int | None = None
 
     def set_led(self, lit: bool = True) -> None:
@@ -83,7 +84,7 @@ class LightSensor:
         """
         if self._type is None:
             self.set_led()
-        deadline = self._clock.monotonic() + self._valid_s
+        deadline = self._clock.monotonic() + _VALID_S
         number = 0
         while True:
             number += 1
@@ -94,8 +95,7 @@ class LightSensor:
                 return values.raw
             if number >= N_INVALID and self._clock.monotonic() > deadline:
                 raise SensorError(
-                    f"input {self.port + 1} gave no valid reading for {self._valid_s:g} s; "
-                    "is the light sensor plugged in?"
+                    f"input {self.port + 1} gave no valid reading for {_VALID_S:g} s; is the light sensor plugged in?"
                 )
             if not as_set:  # a program that starts or stops resets all settings
                 self.set_led(self._type == nxt.LED_ON)
@@ -162,9 +162,9 @@ class Brick:
             finally:
                 self.link.close()
 
-    def motor(self, port: int, *, guard: Guard | None = None, drive: DriveParameters | None = None) -> Motor:
+    def motor(self, port: int, *, guard: Guard | None = None) -> Motor:
         """Make the motor at port 0 to 2; see `Motor`."""
-        return Motor(self.link, port, guard=guard, drive=drive, clock=self._clock)
+        return Motor(self.link, port, guard=guard, clock=self._clock)
 
     def light_sensor(self, port: int) -> LightSensor:
         """Return the light sensor at input 0 to 3, the same object at every call; see `LightSensor`."""

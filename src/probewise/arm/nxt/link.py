@@ -13,7 +13,6 @@ import shlex
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, Self, TypeVar
 
 from probewise.arm.instrument import Clock
@@ -47,22 +46,14 @@ class ByteStream(Protocol):
         """Close the connection."""
 
 
-@dataclass(frozen=True)
-class Timing:
-    """Timeouts and delays of the connection."""
-
-    answer_s: float = 2.0  # timeout of an answer
-    turn_s: float = 0.03  # the radio changes between sending and receiving; a question with its answer takes two
-    gap_s: float = 0.015  # pause after a telegram without an answer
-    silence_s: float = 0.2  # after which the stream counts as drained
-    keep_awake_s: float = 60.0  # between keep-alive commands; a third of the brick's sleep limit if that is shorter
-    n_repeats: int = 2  # of a question without a valid answer, if repeating it is harmless
-
-    @property
-    def longest_s(self) -> float:
-        """Longest duration of a question, with its repeats and fences, on a stream that is never silent."""
-        draining_s, waiting_s = self.answer_s + self.silence_s, 2 * self.turn_s + self.answer_s
-        return (1 + self.n_repeats) * (1 + len(FENCES)) * (waiting_s + draining_s)
+ANSWER_S = 2.0  # timeout of an answer
+TURN_S = 0.03  # the radio changes between sending and receiving; a question with its answer takes two
+GAP_S = 0.015  # pause after a telegram without an answer
+SILENCE_S = 0.2  # after which the stream counts as drained
+KEEP_AWAKE_S = 60.0  # between keep-alive commands; a third of the brick's sleep limit if that is shorter
+N_REPEATS = 2  # of a question without a valid answer, if repeating it is harmless
+LONGEST_S = (1 + N_REPEATS) * (1 + len(FENCES)) * (2 * (TURN_S + ANSWER_S) + SILENCE_S)
+"""Longest duration of a question, with its repeats and fences, on a stream that is never silent."""
 
 
 class NoAnswerError(LinkError):
@@ -72,8 +63,8 @@ class NoAnswerError(LinkError):
 class Link:
     """A connection to a brick over an open stream; `n_sent` counts telegrams."""
 
-    def __init__(self, stream: ByteStream, *, clock: Clock = time, timing: Timing = Timing()) -> None:
-        self._stream, self._clock, self._timing, self.name = stream, clock, timing, stream.name
+    def __init__(self, stream: ByteStream, *, clock: Clock = time) -> None:
+        self._stream, self._clock, self.name = stream, clock, stream.name
         self.n_sent = 0
         self._owed = {UNKNOWN}
         self._free_at = clock.monotonic()
@@ -87,7 +78,7 @@ class Link:
         TelegramError if the received bytes are not an answer; LinkError if the connection is dead.
         """
         self.keep_awake()
-        for n_left in reversed(range(1 + self._timing.n_repeats if request.is_repeatable else 1)):
+        for n_left in reversed(range(1 + N_REPEATS if request.is_repeatable else 1)):
             try:
                 self._await_turn()
                 if self._owed or self._stream.read(nxt.LONGEST, 0.0):
@@ -109,17 +100,17 @@ class Link:
     def tell(self, request: nxt.Request[A]) -> None:
         """Send a command without requesting an answer; whether the brick executed it is unknown."""
         self._send(nxt.encode(request, wants_reply=False))
-        self._free_at = self._clock.monotonic() + self._timing.gap_s
+        self._free_at = self._clock.monotonic() + GAP_S
 
     def keep_awake(self) -> None:
-        """Reset the brick's sleep timer if that was not done for `keep_awake_s`; `ask` does so too."""
+        """Reset the brick's sleep timer if that was not done for `KEEP_AWAKE_S`; `ask` does so too."""
         if self._clock.monotonic() < self._awake_until:
             return
         # Set first: `ask` calls this method.
-        self._awake_until = self._clock.monotonic() + self._timing.keep_awake_s
+        self._awake_until = self._clock.monotonic() + KEEP_AWAKE_S
         limit_s = self.ask(nxt.KEEP_ALIVE) / 1000
         if limit_s > 0:
-            self._awake_until = self._clock.monotonic() + min(self._timing.keep_awake_s, limit_s / 3)
+            self._awake_until = self._clock.monotonic() + min(KEEP_AWAKE_S, limit_s / 3)
 
     def close(self) -> None:
         """Close the connection."""
@@ -130,10 +121,10 @@ class Link:
         self._owed.add(request.opcode)
         self._send(nxt.encode(request))
         sent_at = self._clock.monotonic()
-        self._free_at = sent_at + 2 * self._timing.turn_s
-        reply = self._await_reply(request, sent_at + self._timing.answer_s)
+        self._free_at = sent_at + 2 * TURN_S
+        reply = self._await_reply(request, sent_at + ANSWER_S)
         self._owed.discard(request.opcode)
-        self._free_at = max(self._free_at, self._clock.monotonic() + self._timing.turn_s)
+        self._free_at = max(self._free_at, self._clock.monotonic() + TURN_S)
         return reply
 
     def _discard_late_answers(self) -> None:
@@ -152,9 +143,9 @@ class Link:
         raise LinkError(f"the NXT on {self.name} does not answer any more; is it on, charged and near?")
 
     def _drain(self) -> None:
-        """Read and drop bytes (late or incomplete answers) until the stream is silent, for `answer_s` at most."""
-        deadline = self._clock.monotonic() + self._timing.answer_s
-        while self._clock.monotonic() < deadline and self._stream.read(nxt.LONGEST, self._timing.silence_s):
+        """Read and drop bytes (late or incomplete answers) until the stream is silent, for `ANSWER_S` at most."""
+        deadline = self._clock.monotonic() + ANSWER_S
+        while self._clock.monotonic() < deadline and self._stream.read(nxt.LONGEST, SILENCE_S):
             pass
 
     def _send(self, telegram: bytes) -> None:
@@ -189,7 +180,7 @@ class Link:
             left_s = deadline - self._clock.monotonic()
             if left_s <= 0:
                 raise NoAnswerError(
-                    f"the NXT did not answer {request.name} within {self._timing.answer_s:g} s on {self.name}; "
+                    f"the NXT did not answer {request.name} within {ANSWER_S:g} s on {self.name}; "
                     "is the brick on and paired?"
                 )
             got += self._stream.read(size - len(got), left_s)

@@ -56,14 +56,6 @@ def test_a_whole_turn_takes_no_time():
         assert duration_s(arm, turned, origin_mm=ORIGIN) == duration_s(arm, plan, origin_mm=ORIGIN)
 
 
-def test_it_goes_on_behind_the_rows_that_were_taken(told):
-    plan = thinned(paper_plan())
-    first = told.take(plan, first=len(plan) - 3)
-    assert len(first) == 3
-    # The person is asked anew: nobody knows what happened in between.
-    assert told.asked[0].text.startswith("lay sheet 'quadrant_b'")
-
-
 def test_a_plan_that_the_arm_cannot_reach_moves_nothing(told):
     plan = paper_plan()
     with pytest.raises(

@@ -14,71 +14,32 @@ from probewise.errors import ParameterError
 LED_ON, LED_OFF = t.LED_ON, t.LED_OFF
 
 # Command, whether it wants an answer, the frame sent (length first), the frame that comes back, what that says.
+LIGHT, RUN = t.get_input_values(1), {"run_state": 0x20}
 VECTORS = [
     (t.set_input_type(1, LED_ON), True, "05 00 00 05 01 05 00", "03 00 02 05 00", None),
     (t.set_input_type(1, LED_OFF), False, "05 00 80 05 01 06 00", None, None),
-    (
-        t.get_input_values(1),
-        True,
-        "03 00 00 07 01",
-        "10 00 02 07 00 01 01 00 05 80 00 02 35 02 37 00 35 02",
-        t.InputValues(1, 1, 0, 5, 0x80, 512, 565, 55, 565),
-    ),
-    (
-        t.get_input_values(1),
-        True,
-        "03 00 00 07 01",
-        "10 00 02 07 00 01 00 00 06 00 80 02 78 01 78 01 78 01",
-        t.InputValues(1, 0, 0, 6, 0, 640, 376, 376, 376),
-    ),
-    (
-        t.set_output_state(2, 75, 7, 1, run_state=0x20, limit_counts=90),
-        False,
-        "0C 00 80 04 02 4B 07 01 00 20 5A 00 00 00",
-        None,
-        None,
-    ),
-    (
-        t.set_output_state(2, -40, 5, 1, run_state=0x20, limit_counts=1000),
-        True,
-        "0C 00 00 04 02 D8 05 01 00 20 E8 03 00 00",
-        "03 00 02 04 00",
-        None,
-    ),
+    (LIGHT, True, "03 00 00 07 01", "10 00 02 07 00 01 01 00 05 80 00 02 35 02 37 00 35 02",
+     t.InputValues(1, 1, 0, 5, 0x80, 512, 565, 55, 565)),
+    (LIGHT, True, "03 00 00 07 01", "10 00 02 07 00 01 00 00 06 00 80 02 78 01 78 01 78 01",
+     t.InputValues(1, 0, 0, 6, 0, 640, 376, 376, 376)),
+    (t.set_output_state(2, 75, 7, 1, limit_counts=90, **RUN), False, "0C 00 80 04 02 4B 07 01 00 20 5A 00 00 00",
+     None, None),
+    (t.set_output_state(2, -40, 5, 1, limit_counts=1000, **RUN), True, "0C 00 00 04 02 D8 05 01 00 20 E8 03 00 00",
+     "03 00 02 04 00", None),
     (t.set_output_state(0xFF), False, "0C 00 80 04 FF 00 00 00 00 00 00 00 00 00", None, None),
-    (
-        t.set_output_state(1, 0, 7, 1, run_state=0x20, limit_counts=0),
-        False,
-        "0C 00 80 04 01 00 07 01 00 20 00 00 00 00",
-        None,
-        None,
-    ),
-    (
-        t.get_output_state(2),
-        True,
-        "03 00 00 06 02",
-        "19 00 02 06 00 02 D8 05 01 00 20 E8 03 00 00 85 FF FF FF 85 FF FF FF D7 11 00 00",
-        t.OutputState(2, -40, 5, 1, 0, 0x20, 1000, -123, -123, 4567),
-    ),
+    (t.set_output_state(1, 0, 7, 1, **RUN), False, "0C 00 80 04 01 00 07 01 00 20 00 00 00 00", None, None),
+    (t.get_output_state(2), True, "03 00 00 06 02",
+     "19 00 02 06 00 02 D8 05 01 00 20 E8 03 00 00 85 FF FF FF 85 FF FF FF D7 11 00 00",
+     t.OutputState(2, -40, 5, 1, 0, 0x20, 1000, -123, -123, 4567)),
     (t.reset_rotation_counter(2), True, "04 00 00 0A 02 00", "03 00 02 0A 00", None),
     (t.GET_BATTERY_LEVEL, True, "02 00 00 0B", "05 00 02 0B 00 F4 1C", 7412),
     (t.KEEP_ALIVE, True, "02 00 00 0D", "07 00 02 0D 00 C0 27 09 00", 600000),
     (t.GET_CURRENT_PROGRAM_NAME, True, "02 00 00 11", "17 00 02 11 00 61 72 6D 2E 72 78 65" + 13 * " 00", "arm.rxe"),
-    (
-        t.GET_FIRMWARE_VERSION,
-        True,
-        "02 00 01 88",
-        "07 00 02 88 00 7C 01 1F 01",
-        t.FirmwareVersion(protocol_minor=124, protocol_major=1, firmware_minor=31, firmware_major=1),
-    ),
-    (
-        t.GET_DEVICE_INFO,
-        True,
-        "02 00 01 9B",
-        "21 00 02 9B 00 41 52 4D 31" + 11 * " 00" + " 00 16 53 0A 0B 0C 00" + 4 * " 00" + " 00 F0 00 00",
-        "ARM1",
-    ),
-]
+    (t.GET_FIRMWARE_VERSION, True, "02 00 01 88", "07 00 02 88 00 7C 01 1F 01",
+     t.FirmwareVersion(protocol_minor=124, protocol_major=1, firmware_minor=31, firmware_major=1)),
+    (t.GET_DEVICE_INFO, True, "02 00 01 9B",
+     "21 00 02 9B 00 41 52 4D 31" + 11 * " 00" + " 00 16 53 0A 0B 0C 00" + 4 * " 00" + " 00 F0 00 00", "ARM1"),
+]  # fmt: skip
 NAMES = [f"{vector[0].name} {number}" for number, vector in enumerate(VECTORS, start=1)]
 
 # Command, the frame of a refusal, its status.
@@ -98,18 +59,11 @@ def unframed(text):
     return frame[2:]
 
 
-@pytest.mark.parametrize("vector", VECTORS, ids=NAMES)
-def test_a_command_has_the_bytes_that_the_protocol_gives_it(vector):
-    command, wants_reply, sent, _, _ = vector
+@pytest.mark.parametrize(("command", "wants_reply", "sent", "received", "says"), VECTORS, ids=NAMES)
+def test_commands_and_answers_have_the_bytes_that_the_protocol_gives_them(command, wants_reply, sent, received, says):
     assert framed(encode(command, wants_reply=wants_reply)) == bytes.fromhex(sent)
-
-
-@pytest.mark.parametrize(
-    "vector", [v for v in VECTORS if v[1]], ids=[n for v, n in zip(VECTORS, NAMES, strict=True) if v[1]]
-)
-def test_an_answer_says_what_the_protocol_says_it_does(vector):
-    command, _, _, received, says = vector
-    assert command.decode_answer(decode(unframed(received))) == says
+    if received is not None:
+        assert command.decode_answer(decode(unframed(received))) == says
 
 
 @pytest.mark.parametrize(

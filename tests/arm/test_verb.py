@@ -86,10 +86,3 @@ def test_a_scan_that_leaves_the_reach_moves_nothing_and_prints_nothing(dry, monk
     assert "126 to 755 mm from the arm's axis" in told.err
     assert "of these 6 places 5 are in reach" in told.err
     assert "Pose(" not in told.err
-
-
-def test_a_brick_that_is_not_there_is_told_of_with_status_1(tmp_path, capsys):
-    pytest.importorskip("serial", reason="pyserial is not installed")
-    error = said(capsys, "arm", "read", "--arm", f"nxt:{tmp_path}/rfcomm0", status=1).err
-    assert "cannot be opened" in error
-    assert error.count("\n") == 1

@@ -109,13 +109,6 @@ def test_missing_readings_and_those_out_of_range_are_left_out_and_noted():
             made(reading=wrong)
 
 
-def test_text_columns_of_a_table_are_noted_and_left_out():
-    table = {"x_mm": [0, 1], "y_mm": [0, 0], "reading": [1, 2], "who": ["me", "you"], "lux": [3, 4]}
-    recording = of_table(table)
-    assert list(recording.plan.covariates) == ["lux"]
-    assert recording.notes == ("column who holds no numbers, ignored",)
-
-
 def test_a_table_may_say_n_a_where_a_number_is_missing_and_hold_dates():
     begun = datetime.datetime(2026, 11, 23, 18, 0, tzinfo=datetime.UTC)
     dates = [begun + datetime.timedelta(seconds=s) for s in (0, 2, 5)]

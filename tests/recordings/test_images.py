@@ -1,5 +1,6 @@
 """PNG and .npy pictures, and damaged ones."""
 
+import io
 import struct
 import zlib
 
@@ -65,13 +66,41 @@ def test_a_picture_that_cannot_be_used_is_named(tmp_path, what):
         read_image(tmp_path / "a.png")
 
 
-@pytest.mark.parametrize(
-    "values", [np.zeros(3), np.array([[256.0]]), np.array([[np.nan]]), np.array([["a"]]), np.zeros((0, 2)), b"", b"abc"]
-)
-def test_an_array_that_is_no_picture_is_refused(tmp_path, values):
-    if isinstance(values, bytes):
-        (tmp_path / "a.npy").write_bytes(values)
-    else:
-        np.save(tmp_path / "a.npy", values)
-    with pytest.raises(FileError, match="a\\.npy: "):
+def npy(header, content=b"", version=b"\x01\x00"):
+    size = struct.pack("<H" if version == b"\x01\x00" else "<I", len(header))
+    return b"\x93NUMPY" + version + size + header.encode() + content
+
+
+def described(shape, kind="|u1"):
+    return f"{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}\n"
+
+
+def saved(values):
+    file = io.BytesIO()
+    np.save(file, values)
+    return file.getvalue()
+
+
+ARRAYS = {
+    "one row": saved(np.zeros(3)),
+    "beyond white": saved(np.array([[256.0]])),
+    "NaN": saved(np.array([[np.nan]])),
+    "texts": saved(np.array([["a"]])),
+    "no pixel": saved(np.zeros((0, 2))),
+    "nothing": b"",
+    "a picture of 100,000 x 100,000": npy(described("(100000, 100000)")),
+    "a negative shape": npy(described("(-1, -4)"), bytes(4)),
+    "two thousand brackets": npy("(" * 2000 + ")" * 2000),
+    "Python objects": npy(described("(2, 2)", "|O"), bytes(32)),
+    "cut short": npy(described("(4, 4)"), bytes(15)),
+    "another file's first bytes": b"\x89PNG\r\n\x1a\n" + bytes(100),
+    "a header that is cut short": b"\x93NUMPY\x01\x00\xff\xff{",
+    "a header of a gigabyte": b"\x93NUMPY\x02\x00\xff\xff\xff\x3f{",
+}
+
+
+@pytest.mark.parametrize("what", ARRAYS)
+def test_an_array_that_is_no_picture_is_refused_by_its_header(tmp_path, what):
+    (tmp_path / "a.npy").write_bytes(ARRAYS[what])
+    with pytest.raises(FileError, match=r"a\.npy: no such picture"):
         read_image(tmp_path / "a.npy")

@@ -52,17 +52,6 @@ def test_byte_order_mark_crlf_quotes_blanks_and_empty_lines_are_accepted(tmp_pat
     assert recording.plan.scan_names == ("a, b",)
 
 
-def test_orientation_stands_in_degrees_and_is_held_in_radians(tmp_path):
-    plan = read_plan(put(tmp_path, "x_mm,y_mm,orientation_deg\n0,0,90\n0,0,-45\n"))
-    np.testing.assert_array_equal(plan.orientation_rad, [np.pi / 2, -np.pi / 4])
-
-
-def test_a_scan_name_that_returns_is_a_new_scan(tmp_path):
-    plan = read_plan(put(tmp_path, "x_mm,y_mm,scan\n0,0,a\n1,0,a\n0,0,b\n3,0,a\n"))
-    np.testing.assert_array_equal(plan.scan, [0, 0, 1, 2])
-    assert plan.scan_names == ("a", "b", "a")
-
-
 def test_a_session_is_a_number_of_each_scan_and_one_session_is_none(tmp_path):
     csv = "x_mm,y_mm,reading,scan,session\n0,0,1,a,0\n1,0,1,a,0\n0,0,1,b,{0}\n1,0,1,c,{0}\n"
     assert read_plan(put(tmp_path, csv.format(3))).sessions == (0, 3, 3)

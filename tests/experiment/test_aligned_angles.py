@@ -77,7 +77,7 @@ def test_a_run_that_trusts_its_sensor_looks_for_lost_modes_before_it_ends(small)
     experiment = small.experiment(method=Counted(600, 40, (asked,)))
     result = run(small.arm(), experiment, rng=np.random.default_rng(5))
     assert result.target_reached
-    assert asked == [len(result.steps)]
+    assert set(asked) == {len(result.steps)}
     plain = run(small.arm(), replace(experiment, method=None), rng=np.random.default_rng(5))
     assert len(plain.steps) == len(result.steps)
     np.testing.assert_array_equal(plain.last.mean, result.last.mean)  # it was asked, and had nothing to change

@@ -129,6 +129,22 @@ def test_a_search_that_ends_in_a_false_mode_is_set_right_where_the_leader_has_th
     assert found.log_z == pytest.approx(-23.6, abs=1.5)
 
 
+@pytest.mark.parametrize("name", ["dark_level", "dropouts", "position_scale"])
+def test_a_rival_that_was_never_searched_has_its_evidence_to_first_order(doubting, name):
+    """About the plain sensor's samples, after a few readings of noise: that of nested sampling within half a nat."""
+    kinds = [kind for kind in doubting.kinds if kind.left_out in ("", name)][:2]
+    method, rng = doubting.inference_method, np.random.default_rng(2)
+    places = [(500.0, 260.0), (250.0, 130.0), (790.0, 400.0), (270.0, 390.0)]
+    taken = [Reading(10.0 + rng.standard_normal(), Pose(*place), 8.0 * k) for k, place in enumerate(places)]
+    now = prior_posterior(kinds, 3000, rng=rng)
+    for n in range(1, 5):
+        recording = doubting.problem(taken[:n]).recording
+        now = method.updated(now, recording, rng=rng)
+    assert now.particles[1].lost_log_z == math.inf
+    right = nested_sampling_from_scratch(kinds[1].problem(recording), n_live=400, rng=rng)
+    assert now.particles[1].log_z == pytest.approx(right.log_z, abs=0.5)
+
+
 @pytest.mark.parametrize(("behind", "sleeps"), [(60.0, True), (3.0, False)])
 def test_a_kind_that_a_search_found_far_behind_sleeps_and_is_solved_from_the_prior_when_it_wakes(
     doubting, behind, sleeps

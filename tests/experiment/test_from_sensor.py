@@ -1,18 +1,14 @@
 """The experiment of a fitted sensor: its effects, and the sensor as an unknown beside the shape."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from exploring import run
+from exploring import ChainArm, run
 from hand_made import NAMES, sensor_of
 
-from probewise.arm.instrument import Reading
 from probewise.effects import Origin
 from probewise.experiment import experiment_for
 from probewise.experiment.from_sensor import AdjustedMixture, sensor_change_prior
 from probewise.inference import GaussianKnown
-from probewise.inquiry import Grid
 from probewise.scene import Circle, Field, HypothesisScene
 from probewise.sensor import FAST_NODES, Chain, FixedLevels, FixedMixture, FreeLevels
 
@@ -42,29 +38,6 @@ def test_an_adjustment_stretches_about_the_mean_and_shifts():
     np.testing.assert_allclose([var_u, cov], [np.var(moved[:, 0]), np.cov(moved.T)[0, 1]], rtol=0.1, atol=0.1)
 
 
-class TrueArm:
-    """Reads the true sensor over a true circle, with unit noise of its own."""
-
-    def __init__(self, circle, truth):
-        self.chain = Chain(TRUE, FixedLevels(10.0, 60.0), HypothesisScene(circle))
-        self.truth, self.noise = np.array([truth]), rng(5)
-
-    def reachable(self, places_mm):
-        return np.ones(len(places_mm), bool)
-
-    def orientation_rad(self, places_mm):
-        return np.zeros(len(places_mm))
-
-    def travel_s(self, start, places_mm):
-        return np.ones(len(places_mm))
-
-    def measure(self, pose):
-        plan = Grid(2.0, 2.0, 2, 2).plan("field").take(np.array([0]))
-        plan = replace(plan, x_mm=np.array([pose.x_mm]), y_mm=np.array([pose.y_mm]))
-        value = self.chain.predict(self.truth, plan)[0, 0] + self.noise.standard_normal()
-        return Reading(float(value), pose, 0.0)
-
-
 @pytest.mark.slow
 def test_a_footprint_taken_for_a_half_too_wide_is_put_right(small):
     """Within five sds; the wrong SSF taken for true is off by more than it states."""
@@ -76,7 +49,8 @@ def test_a_footprint_taken_for_a_half_too_wide_is_put_right(small):
     learning = small.experiment(
         model=Chain(AdjustedMixture(wide), FreeLevels(), scene, n_nodes=FAST_NODES), sensor_prior=SENSOR, **options
     )
-    found = run(TrueArm(circle, truth), learning, rng=rng(), max_readings=25)
+    arm = ChainArm(Chain(TRUE, FixedLevels(10.0, 60.0), scene), truth)
+    found = run(arm, learning, rng=rng(), max_readings=25)
     assert (np.abs(found.last.mean - truth) < 5 * found.last.sd).all()
     assert found.last.names == ("x_mm", "y_mm", "radius_mm")
     assert found.last.samples.shape[1] == 3

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from exploring import run
+from exploring import ChainArm, run
 from scipy.stats import multivariate_normal
 
 from probewise.arm.instrument import Pose, Reading
@@ -86,22 +86,6 @@ def test_bits_agree_with_the_entropy_of_the_posterior_samples(found):
     assert result.last.bits == pytest.approx(prior_bits - gaussian_bits, abs=error)
 
 
-def test_the_summary_gives_bits_and_the_papers_count(found):
-    result, _ = found
-    text = result.summary()
-    assert f"{25 / len(result.steps):.2f} per reading" in text
-    assert f"{result.last.bits / len(result.steps):.2f} per reading" in text
-    assert "radius_mm" in text
-    assert result.steps[0].summary().startswith("reading 1: ")
-
-
-def test_the_naive_model_asks_yes_or_no_and_needs_more_readings(found, small):
-    naive = run(small.arm(sensor=small.sensor(0.0)), small.experiment(blur_mm=0.0), rng=rng(), max_readings=60)
-    assert naive.target_reached
-    assert all(info.map.highest_utility <= 1.0 + 1e-5 for info in naive.steps)  # single precision
-    assert len(naive.steps) > len(found[0].steps)
-
-
 def test_a_step_by_hand_is_a_step_of_the_loop(small):
     experiment, arm = small.experiment(), small.arm()
     first = next(iter(explore(arm, experiment, rng=rng())))
@@ -136,19 +120,6 @@ def test_one_seed_gives_one_run_and_two_runs_of_a_generator_differ(small):
     shared = rng()
     first, second = (run(small.arm(), experiment, rng=shared, max_readings=2) for _ in range(2))
     assert first.readings[0].pose != second.readings[0].pose
-
-
-@pytest.mark.parametrize("n_before", [1, 4])
-def test_a_run_that_was_interrupted_goes_on_bit_for_bit(small, found, tmp_path, n_before):
-    whole, journal = found[0], tmp_path / "journal.jsonl"
-    for info in explore(small.arm(), small.experiment(), rng=rng(), journal=journal):
-        if info.number == n_before:
-            break
-    arm = small.arm()
-    resumed = run(arm, small.experiment(), rng=rng(), journal=journal)
-    assert len(arm.poses) == len(whole.steps) - n_before
-    assert all(same(a, b) for a, b in zip(whole.steps, resumed.steps, strict=True))
-    assert [info.replayed for info in resumed.steps] == [k < n_before for k in range(len(whole.steps))]
 
 
 def test_a_simulated_run_resumed_at_any_reading_writes_the_journal_of_one_never_interrupted(small, tmp_path):
@@ -327,28 +298,6 @@ def real_experiment(small, shape, **changes):
     return small.experiment(shape=shape, model=chain, likelihood=GaussianKnown(1.0), **changes)
 
 
-class ChainArm:
-    """Reads a chain over a true shape, with noise by place."""
-
-    def __init__(self, chain, truth):
-        self.chain, self.truth = chain, np.array([truth])
-
-    def reachable(self, places_mm):
-        return np.ones(len(places_mm), bool)
-
-    def orientation_rad(self, places_mm):
-        return np.zeros(len(places_mm))
-
-    def travel_s(self, start, places_mm):
-        return np.ones(len(places_mm))
-
-    def measure(self, pose):
-        plan = Grid(2.0, 2.0, 2, 2).plan("field").take(np.array([0]))
-        plan = replace(plan, x_mm=np.array([pose.x_mm]), y_mm=np.array([pose.y_mm]))
-        noise = rng([int(1000 * pose.x_mm), int(1000 * pose.y_mm)]).standard_normal()
-        return Reading(float(np.rint(self.chain.predict(self.truth, plan)[0, 0] + noise)), pose, 0.0)
-
-
 @pytest.mark.slow
 def test_of_a_set_of_shapes_the_robot_finds_which_and_where(small):
     """Paper: "a general system that works for any expected shape or set of shapes"."""
@@ -481,17 +430,6 @@ def test_a_run_that_nothing_within_reach_can_advance_stops_and_says_so(small):
 
 
 ONE_PLACE = Grid(400.0, 300.0, 3, 3)  # of which (200, 0) is the only one within 30 mm of the arm
-
-
-def test_the_only_place_within_reach_is_read_while_it_tells_something(small):
-    """A blurred edge leaves a little to learn from the mean of further readings at one place."""
-    arm = small.arm(reach_mm=30.0, truth=(230.0, 40.0, 60.0))
-    result = run(arm, small.experiment(grid=ONE_PLACE), rng=rng(), max_readings=4)
-    assert [(pose.x_mm, pose.y_mm) for pose in arm.poses] == [(200.0, 0.0)] * 4
-    assert result.stop_reason.startswith("all 4 readings that it may take are taken")
-    bits = [info.bits for info in result.steps]
-    assert bits[0] > 0.05
-    assert result.steps[0].map.highest_utility > result.steps[2].map.highest_utility > 0
 
 
 @np.errstate(all="raise")  # which is the caller's, and ends no run

@@ -41,11 +41,6 @@ def test_parameters_are_told_by_the_clock():
     np.testing.assert_allclose(pace.in_seconds(drift, np.array([1.0])), [4.0])
 
 
-def test_one_reading_has_the_usual_pace():
-    assert Pace.from_readings(readings(2.0)[:1]).s_per_reading == PACED_S_PER_READING
-    assert Pace.from_readings([]) == Pace()
-
-
 def test_a_lamp_that_begins_as_calibrated_may_fade():
     plan = experiment_of(REFERENCE).problem(readings(8.0)).recording.plan
     faded = gain_loss().apply(np.full((1, 8), 50.0), np.array([[-0.5, 800.0]]), plan)[0]
@@ -57,15 +52,6 @@ def test_a_lamp_that_begins_as_calibrated_may_fade():
 @pytest.mark.parametrize(("tau_s", "told"), [(10.0, "falls by 10 % in the end, 10 % in the"), (6000.0, "0.1 % in the")])
 def test_a_lamp_never_fades_by_more_in_a_minute_than_in_the_end(tau_s, told):
     assert told in gain_loss().sentence(np.array([-0.1, tau_s]), np.zeros(2))
-
-
-def test_the_ways_of_one_name_share_what_it_has():
-    experiment = replace(experiment_of(REFERENCE), trust=0.9)
-    shares: dict[str, float] = {}
-    for kind in experiment.kinds:
-        shares[kind.left_out] = shares.get(kind.left_out, 0.0) + float(np.exp(kind.log_prior))
-    assert shares["gain_drift"] == pytest.approx(shares["backlash"])
-    assert sum(kind.left_out == "gain_drift" for kind in experiment.kinds) == 2
 
 
 def test_samples_keep_their_seconds_where_the_pace_changes():

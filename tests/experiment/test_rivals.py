@@ -44,7 +44,6 @@ from probewise.experiment.inquire import (
 )
 from probewise.experiment.judgement import trend_of_residuals
 from probewise.experiment.kinds import PosteriorByKind, prior_posterior
-from probewise.experiment.method import SequentialMonteCarlo
 from probewise.experiment.noise_rivals import DeclaredNoise, noise_likelihoods
 from probewise.experiment.rivals import rivals_of
 from probewise.inference import Rounded
@@ -430,13 +429,26 @@ def test_a_run_that_knows_the_shape_asks_what_the_sensor_leaves_out():
     assert np.abs(steps[-1].mean - trial.true_circle_in_arm_frame).max() < 2.0
 
 
-def test_a_memory_of_the_noise_is_heard():
-    """Errors that repeat each other are likelier under it, errors that do not under the plain noise."""
-    law, level = noise_likelihoods(DeclaredNoise(1.0, 0.0), LEVELS)["correlated_noise"], np.full((1, 12), 35.0)
-    alike, apart = 35.0 + np.full(12, 1.5), 35.0 + 1.5 * np.tile([1.0, -1.0, -1.0, 1.0], 3)
-    plain = experiment_of(REFERENCE).likelihood
-    gained = [float((law.log_prob(read, level) - plain.log_prob(read, level))[0]) for read in (alike, apart)]
-    assert gained[0] > 3.0
+BOTH = [10.0, 60.0] * 6
+HEARD = {
+    "correlated_noise": ([35.0] * 12, 1.5 * np.ones(12), 1.5 * np.tile([1.0, -1.0, -1.0, 1.0], 3), 3.0),
+    "signal_dependent_noise": (BOTH, np.tile([0.5, 4.0, -0.5, -4.0], 3), np.tile([1.0, -0.5], 6), 5.0),
+    "dropouts": ([60.0, 10.0, 10.0, 10.0, 60.0], [0.3, 0.0, 0.0, 0.0, -0.9], [0.3, 0.4, -0.8, 0.9, -0.9], 5.0),
+}
+"""By law: levels, errors that speak for it, errors of plain noise, and the least gain in nats from the first.
+
+Errors that repeat each other; errors that grow with the light; three readings black to the last digit."""
+
+
+@pytest.mark.parametrize("name", HEARD)
+def test_a_law_of_the_noise_is_heard_in_its_errors_and_not_in_others(name):
+    level, speaking, plain, least = HEARD[name]
+    law, usual = noise_likelihoods(DeclaredNoise(1.0, 0.0), LEVELS)[name], experiment_of(REFERENCE).likelihood
+    gained = [
+        float((law.log_prob(read, np.array([level])) - usual.log_prob(read, np.array([level])))[0])
+        for read in (np.array(level) + np.array(errors) for errors in (speaking, plain))
+    ]
+    assert gained[0] > least
     assert gained[1] < 0.5
 
 
@@ -473,70 +485,8 @@ def test_readings_at_an_end_or_rounded_as_declared_recur_by_nature(plain, level,
     assert law.log_prob(*of)[0] == pytest.approx(plain.log_prob(*of)[0], abs=1e-3)
 
 
-def test_noise_that_grows_with_the_light_is_heard():
-    law, level = (
-        noise_likelihoods(DeclaredNoise(1.0, 0.0), LEVELS)["signal_dependent_noise"],
-        np.repeat([[10.0, 60.0]], 6, axis=1).reshape(1, 12),
-    )
-    read = level[0] + np.where(level[0] > 50, 4.0, 0.5) * np.tile([1.0, -1.0], 6)
-    plain = experiment_of(REFERENCE).likelihood
-    assert law.log_prob(read, level)[0] > plain.log_prob(read, level)[0] + 5.0
-
-
-def test_readings_lost_to_exactly_black_are_no_chance():
-    """Noise never repeats a value; three readings that are black to the last digit were lost."""
-    law = laws("dropouts")[0]
-    level = np.array([[60.0, 10.0, 10.0, 10.0, 60.0]])
-    plain = experiment_of(REFERENCE).likelihood
-    exact, noisy = np.array([60.3, 10.0, 10.0, 10.0, 59.1]), np.array([60.3, 10.4, 9.2, 10.9, 59.1])
-    gained = [float((law.log_prob(read, level) - plain.log_prob(read, level))[0]) for read in (exact, noisy)]
-    assert gained[0] > 5.0
-    assert gained[1] < 0.5
-
-
 PLAYED = [(846.5, 260.0), (854.5, 260.0), (846.5, 243.8), (854.5, 178.8), (967.4, 243.8), (886.8, 162.5)]
 """Places about a circle, taken from all sides."""
-
-
-def test_a_mode_that_samples_have_lost_is_found_by_a_search_of_the_prior(doubting):
-    """The leading rival's samples followed the readings in a false mode: a periodic error of another period."""
-    rng = np.random.default_rng(4)
-    kinds = [kind for kind in doubting.kinds if kind.left_out in ("", "periodic_position_error")]
-    kind = kinds[1]
-    angle = np.linspace(0.0, 2 * np.pi, 16, endpoint=False)
-    places = [
-        Reading(10.0, Pose(922.0 + 77.0 * math.cos(a), 240.0 + 77.0 * math.sin(a)), 8.0 * k)
-        for k, a in enumerate(angle)
-    ]
-    true = np.array([[922.0, 240.0, 77.0, 8.0, 60.0, 0.5]])
-    level = kind.model.predict(true, doubting.problem(places).recording.plan)[0]
-    recording = doubting.problem(
-        [replace(reading, value=float(v)) for reading, v in zip(places, level, strict=True)]
-    ).recording
-    problem = kind.problem(recording)
-    false = np.array([922.0, 240.0, 77.0, 1.0, 150.0, 0.5]) + 1e-3 * rng.standard_normal((300, 6))
-    start = prior_posterior(kinds, 600, rng=rng)
-    likelihood = problem.log_likelihood(false)
-    lost = replace(
-        start.particles[1],
-        weighted=replace(
-            start.particles[1].weighted,
-            theta=false,
-            log_likelihood=likelihood,
-            log_weight=np.full(300, -math.log(300.0)),
-            log_z=float(likelihood.mean()),
-        ),
-        ancestor=np.arange(300),
-    )
-    plain = replace(start.particles[0], weighted=replace(start.particles[0].weighted, log_z=float(likelihood.mean())))
-    now = replace(start, particles=(plain, lost))
-    found = SequentialMonteCarlo(600, n_live=200).reconsidered(now, recording, rng=rng).particles[1]
-    assert found.log_z > lost.log_z + 20.0
-    # Nine of ten samples of a posterior of six parameters are less than 5.4 nats below its top (chi-square, 6 degrees).
-    at_truth = problem.log_likelihood(true)[0]
-    assert np.quantile(found.weighted.log_likelihood, 0.2) > at_truth - 5.4
-    mean, sd = found.weighted.mean(), found.weighted.sd()
-    assert np.abs(mean[:3] - true[0, :3]).max() < 4 * sd[:3].max()
 
 
 def test_gear_play_may_spare_the_first_reading(doubting):

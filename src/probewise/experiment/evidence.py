@@ -1,10 +1,11 @@
 """The evidence of kinds of hypotheses, from the prior.
 
 Samples that are carried from reading to reading keep only the modes that they have, and their evidence accumulates
-errors. So the prior of a kind is searched: in doubt for a few kinds at a time, and before a run ends for all whose
-samples are doubtful or may lack a probable mode. A quick run of nested sampling finds the modes; importance sampling
-about its samples and the carried ones gives evidence and samples. A kind so improbable that perfect predictions of all
-readings since could not revive it is suspended until they could.
+errors. So a rival is looked at to first order, about the samples of the plain sensor, until its prior is searched: in
+doubt for a few kinds at a time, and before a run ends for all whose samples are doubtful or may lack a probable mode. A
+quick run of nested sampling finds the modes; importance sampling about its samples and the carried ones gives evidence
+and samples. A kind so improbable that perfect predictions of all readings since could not revive it is suspended until
+they could.
 """
 
 from __future__ import annotations
@@ -16,12 +17,19 @@ from dataclasses import replace
 
 import numpy as np
 
-from probewise._arrays import BoolArray, FloatArray
+from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.errors import DoubtfulResultWarning, NotConvergedError
 from probewise.experiment.kinds import KindProblem, PosteriorByKind, n_samples_of_kind
-from probewise.inquiry.smc import BRIEF, LocalKernels, nested_sampling_from_scratch, particles_from_posterior
+from probewise.inquiry.smc import (
+    BRIEF,
+    LocalKernels,
+    Particles,
+    nested_sampling_from_scratch,
+    particles_from_posterior,
+)
 from probewise.nested import Weighted
 from probewise.nested.importance import evenly_weighted, weighted_draws
+from probewise.priors import Prior
 
 _SEARCH_ABOVE = 1e-4  # raised probability of a doubtful or suspended kind, from which on it is searched
 _SEARCH_AT_END_ABOVE = 0.02  # raised probability of a missing mode, from which on it is searched for before the end
@@ -47,6 +55,12 @@ def can_suspend_mask(now: PosteriorByKind) -> BoolArray:
     return np.asarray(known & (raised < _SUSPEND_BELOW) & now.doubts_sensor)
 
 
+def sleeping_mask(now: PosteriorByKind) -> BoolArray:
+    """Mark the rivals whose prior was never searched, which are looked at to first order, (n_kinds,)."""
+    kinds = zip(now.kinds, now.particles, strict=True)
+    return np.array([kind.left_out != "" and samples.lost_log_z == math.inf for kind, samples in kinds])
+
+
 def with_evidence_from_prior(
     now: PosteriorByKind,
     problems: list[KindProblem],
@@ -62,8 +76,9 @@ def with_evidence_from_prior(
     unsure if its samples are doubtful (`Particles.is_doubtful`), if it is suspended and its raised probability above
     1e-4, or if its prior was never searched. After a reading, a few unsure kinds are searched; those below 1e-4 or
     merely never searched only in doubt: while doubtful kinds, or left-out effects, have over half of the probability.
-    Before the run ends, all are, and those where a missing mode could have a probability above 0.02. Where no effect
-    can be left out, only probable kinds are, and their samples change only if they had lost a mode.
+    Before the run ends, all are, the most probable four first, and those where a missing mode could have a probability
+    above 0.02; where there are none, `now` itself is returned. Where no effect can be left out, only probable kinds
+    are, and their samples change only if they had lost a mode.
     """
     possible, by_raised = np.isfinite(now.log_odds).any(), now.with_raised_left_out_odds()
     raised = by_raised.probability if possible else np.ones(len(problems))
@@ -74,12 +89,15 @@ def with_evidence_from_prior(
     if at_end:
         unsure |= log_lost > by_raised.log_z + math.log(_SEARCH_AT_END_ABOVE)
         due = np.flatnonzero(unsure & (now.doubts_sensor | (raised > _SEARCH_AT_END_ABOVE)))
+        due = due[np.argsort(-raised[due], kind="stable")][: 2 * _N_SEARCHED_PER_READING]
     else:
         in_doubt = raised[doubtful].sum() > 0.5 or (now.doubts_sensor and possible and now.left_out[""] < 0.5)
         unsure &= np.full(len(raised), in_doubt) | ((doubtful | suspended) & matters)
         likely, open_ones = np.lexsort((-raised, ~unsure)), np.lexsort((-raised, -log_lost, ~unsure))
         due = np.unique(np.concatenate([likely[:_N_SEARCHED_PER_READING], open_ones[:_N_SEARCHED_PER_READING]]))
         due = due[unsure[due]]
+    if not due.size:
+        return now
     particles, leader = list(now.particles), now.most_probable_kind_index
     leading = now.particles[leader].weighted
     for k in due.tolist():
@@ -88,9 +106,7 @@ def with_evidence_from_prior(
         start = carried.with_zero_evidence() if carried.suspended else carried
         others = None
         if kind.shape == now.kinds[leader].shape and k != leader:
-            others = kind.prior.from_unit_cube(rng.random((n // 2, len(kind.prior.names))))
-            n_shared = sum(map(operator.eq, kind.prior.names, leading.names))  # the sensor's and the shape's come first
-            others[:, :n_shared] = leading.samples(n // 2, rng=rng)[:, :n_shared]
+            others = _beside(leading, leading.draw_rows(n // 2, rng=rng), kind.prior, rng)
         found = posterior_from_prior(start.weighted, problem, n, n_live, rng, others=others)
         if found is None:
             none = carried.with_zero_evidence()
@@ -101,6 +117,31 @@ def with_evidence_from_prior(
             fresh = particles_from_posterior(found, n, problem, rng=rng, effort=BRIEF)
             particles[k] = fresh.searched(found.log_z)
     return replace(now, particles=tuple(particles))
+
+
+def to_first_order(carried: Particles, problem: KindProblem, plain: Weighted, rng: np.random.Generator) -> Particles:
+    """Return a rival's samples and evidence about those of the `plain` sensor over the same shape.
+
+    Shapes are drawn from the plain sensor's posterior and the effect from its prior; the mean ratio of the likelihoods
+    is that of the evidences. It is seldom precise, and tells whether anything speaks for the rival.
+    """
+    rows = plain.draw_rows(len(carried.ancestor), rng=rng)
+    theta = _beside(plain, rows, problem.prior, rng)
+    log_likelihood = problem.log_likelihood(theta)
+    if not np.isfinite(log_likelihood).any():
+        return carried.with_zero_evidence()
+    log_ratio = log_likelihood - plain.log_likelihood[rows]
+    drawn = weighted_draws(problem.prior.names, theta, log_likelihood, log_ratio, len(rows))
+    n_calls = carried.weighted.n_calls + len(rows)
+    return replace(carried, weighted=replace(drawn, log_z=plain.log_z + drawn.log_z, n_calls=n_calls))
+
+
+def _beside(samples: Weighted, rows: IntArray, prior: Prior, rng: np.random.Generator) -> FloatArray:
+    """Draw from a prior, with the sensor's and the shape's parameters, which come first, from `rows` of samples."""
+    theta = prior.from_unit_cube(rng.random((len(rows), len(prior.names))))
+    n_shared = sum(map(operator.eq, prior.names, samples.names))
+    theta[:, :n_shared] = samples.theta[rows, :n_shared]
+    return theta
 
 
 def posterior_from_prior(

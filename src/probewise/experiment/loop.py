@@ -176,8 +176,11 @@ def infer(
         by_kind = method.updated(previous, recording, rng=rng)
     joined = by_kind.with_raised_left_out_odds().joined(rng=rng)
     posterior = with_aligned_angles(experiment, joined)
-    if target_reached_and_chance_off(experiment, posterior)[0]:
-        by_kind = method.reconsidered(by_kind, recording, rng=rng)
+    # A few kinds at a time: as soon as the target is missed, the others can wait.
+    while target_reached_and_chance_off(experiment, posterior)[0]:
+        before, by_kind = by_kind, method.reconsidered(by_kind, recording, rng=rng)
+        if by_kind is before:
+            break
         joined = by_kind.with_raised_left_out_odds().joined(rng=rng)
         posterior = with_aligned_angles(experiment, joined)
     return by_kind, joined, posterior, method.drawn(by_kind, posterior, recording, experiment.n_samples, rng=rng)

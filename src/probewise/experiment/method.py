@@ -11,7 +11,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError
-from probewise.experiment.evidence import can_suspend_mask, with_evidence_from_prior
+from probewise.experiment.evidence import can_suspend_mask, sleeping_mask, to_first_order, with_evidence_from_prior
 from probewise.experiment.kinds import (
     IMPROBABLE,
     SUSPECTED_PROBABILITY,
@@ -48,7 +48,10 @@ class Method(Protocol):
         ...
 
     def reconsidered(self, now: PosteriorByKind, recording: Recording, *, rng: np.random.Generator) -> PosteriorByKind:
-        """Return the posterior with kinds sampled again whose samples may have lost the truth, before a run ends."""
+        """Return the posterior with a few kinds sampled again whose samples may have lost the truth, before a run ends.
+
+        `now` itself, if there are none left.
+        """
         ...
 
     def drawn(
@@ -77,39 +80,45 @@ class SequentialMonteCarlo:
         return f"sequential Monte Carlo, {self.n_particles} samples carried from reading to reading"
 
     def updated(self, previous: PosteriorByKind, recording: Recording, *, rng: np.random.Generator) -> PosteriorByKind:
-        """Reweight, resample and move the samples of every kind by the last reading."""
+        """Reweight, resample and move the samples of every kind by the last reading.
+
+        A rival whose prior was never searched is only looked at to first order (`to_first_order`).
+        """
         problems = [kind.problem(recording) for kind in previous.kinds]
         if len(problems) == 1:
             from_scratch = partial(nested_sampling_from_scratch, problems[0], n_live=self.n_live, rng=rng)
             found = update(previous.particles[0], problems[0], rng=rng, fall_back=from_scratch)
             return replace(previous, particles=(found,))
         usual = STEADY if previous.doubts_sensor else THOROUGH
-        updated = list(previous.particles)
+        updated, plain, sleeping = list(previous.particles), previous.particles[0], sleeping_mask(previous)
         probability, can_suspend = previous.probability, can_suspend_mask(previous)
         time_s = recording.plan.time_s
         s_per_reading = [Pace.from_times(times).s_per_reading for times in (time_s[:-1], time_s)]
         for k, (kind, carried, problem) in enumerate(zip(previous.kinds, previous.particles, problems, strict=True)):
             perfect = problem.perfect_log_likelihood
-            if can_suspend[k]:
+            if sleeping[k] and plain.log_z > -math.inf:
+                found = to_first_order(carried, problem, plain.weighted, rng)
+            elif can_suspend[k]:
                 found = carried.suspended_with(perfect)
             else:
                 effort = BRIEF if kind.left_out and probability[k] < SUSPECTED_PROBABILITY else usual
                 found = update(kind.at_pace(carried, *s_per_reading), problem, rng=rng, effort=effort)
+            plain = plain if kind.left_out else found  # of each shape the first
             updated[k] = replace(found, lost_log_z=carried.lost_log_z + perfect)
         now = replace(previous, particles=tuple(updated))
         now = with_evidence_from_prior(now, problems, self.n_particles, self.n_live, at_end=False, rng=rng)
         if not np.isfinite(now.log_odds).any():
             raise NotConvergedError("no hypothesis of any kind could have given these readings")
-        particles = list(now.particles)
+        particles, sleeping = list(now.particles), sleeping_mask(now)
         for k, (kind, p) in enumerate(zip(now.kinds, now.probability, strict=True)):
             n = n_samples_of_kind(kind, p, self.n_particles)
-            if not particles[k].suspended and (n > len(particles[k].ancestor) or p < IMPROBABLE):
+            if not (particles[k].suspended or sleeping[k]) and (n > len(particles[k].ancestor) or p < IMPROBABLE):
                 effort = BRIEF if kind.left_out else THOROUGH
                 particles[k] = resample_and_move(particles[k], n, problems[k], rng=rng, effort=effort)
         return replace(now, particles=tuple(particles))
 
     def reconsidered(self, now: PosteriorByKind, recording: Recording, *, rng: np.random.Generator) -> PosteriorByKind:
-        """Return the posterior with kinds sampled again whose samples may have lost the truth."""
+        """Return the posterior with a few kinds sampled again whose samples may have lost the truth; see `Method`."""
         problems = [kind.problem(recording) for kind in now.kinds]
         # From another generator: if no mode was lost, the run goes on as without the search.
         search = rng.spawn(1)[0]

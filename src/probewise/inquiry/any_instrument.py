@@ -28,7 +28,7 @@ from probewise.inquiry.predictive import (
     gaussian_nats_above_goal,
     readings_given_noise,
 )
-from probewise.inquiry.smc import LIGHT, nested_sampling_from_scratch, particles_from_run, prior_particles, update
+from probewise.inquiry.smc import LIGHT, nested_sampling_from_scratch, particles_from_posterior, prior_particles, update
 from probewise.nested import Weighted, make_problem
 from probewise.nested.problem import AnyPrior
 from probewise.nested.weights import resampled_rows
@@ -501,7 +501,7 @@ class Inquiry(ShowsItself):
         found = update(self._particles, readings, rng=self._rng, fall_back=search, effort=LIGHT)
         # Samples of the prior that explain the readings better than the posterior does lie in a part that it has lost.
         if found.weighted.run is None and by_prior - found.log_z > _LOST_NATS + self._lost_nats:
-            found = particles_from_run(search(), self._n_samples, readings, n_calls=0, rng=self._rng)
+            found = particles_from_posterior(search(), self._n_samples, readings, rng=self._rng)
         if found.weighted.run is not None:
             self._lost_nats = max(by_prior - found.log_z, 0.0)
         self._particles, self._prior_log_likelihood = found, of_prior

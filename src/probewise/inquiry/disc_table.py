@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 from typing import Any, Self, cast
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from probewise._arrays import FloatArray, IntArray, read_only_floats
 from probewise.effects import Known
@@ -43,8 +43,8 @@ NAMES = ("x_mm", "y_mm", "radius_mm")
 _ROWS = 3  # of a grid per batch, to fit the cache
 _PER_SD = 2.0  # levels per noise sd: rounding adds 2 % to its variance, which thousands of hypotheses average out
 _N_PREDICTED = 200  # hypotheses of other shapes, without effects: with twice as many a map is no better but slower
-_COARSE_MM = 0.5  # spacing of distances at which the model is evaluated, for a cubic spline
-_FINE_MM = 0.125  # spacing of entries
+_COARSE_MM = 0.5  # spacing of distances at which the model is evaluated
+_FINER = 4  # entries of the table for each of these, by cubic interpolation
 _PROBE_MM = 80.0  # largest distance from the edge that is evaluated
 _FLAT = 1e-5  # share of the levels' difference below which a level counts as constant
 _DIRECTIONS = 128
@@ -105,12 +105,11 @@ class DiscTable:
         if margin >= _PROBE_MM:
             return None
         coarse = np.linspace(-margin, margin, 2 * int(np.ceil(margin / _COARSE_MM)) + 1)
-        fine = np.linspace(-margin, margin, 2 * int(np.ceil(margin / _FINE_MM)) + 1)
         readings = np.stack(
             [_readings_around_disc(model, 1.0 / b, directions, coarse) for b in np.linspace(*bends, _BENDS)]
         )
         readings = np.concatenate([readings, readings[:, :1]], axis=1)
-        levels = np.ascontiguousarray(CubicSpline(coarse, readings, axis=-1)(fine))  # so that it is flat for free
+        levels = np.ascontiguousarray(_refined(readings))  # so that it is flat for free
         return cls(dark, bright, margin, bends, read_only_floats(levels))
 
     @property
@@ -321,6 +320,17 @@ def _index_and_fraction(position: FloatArray, n: int) -> tuple[IntArray, FloatAr
     """Split positions in units of the spacing into the index below, of `n`, and the fraction to the next."""
     below = np.clip(position.astype(np.int64), 0, n - 2)
     return below, position - below
+
+
+def _refined(readings: FloatArray) -> FloatArray:
+    """Interpolate evenly spaced readings, constant beyond their ends, by the cubic through the four nearest.
+
+    (n_bends, n_directions, n) -> (n_bends, n_directions, 4 (n - 1) + 1). SciPy's splines take long to import.
+    """
+    t = np.arange(_FINER) / _FINER
+    cubics = -t * (t - 1) * (t - 2) / 6, (t * t - 1) * (t - 2) / 2, -t * (t + 1) * (t - 2) / 2, t * (t * t - 1) / 6
+    nearest = sliding_window_view(np.pad(readings, ((0, 0), (0, 0), (1, 2)), mode="edge"), 4, axis=-1)
+    return np.asarray((nearest @ np.stack(cubics)).reshape(*readings.shape[:2], -1)[..., : 1 - _FINER])
 
 
 def _readings_around_disc(

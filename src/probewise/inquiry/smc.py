@@ -217,7 +217,7 @@ def update(
         given_up = n_temperatures >= effort.most_temperatures
         stuck |= all_at_once == 0.0 or (given_up and all_at_once < least)
         if stuck and fall_back is not None:
-            return particles_from_run(fall_back(), n, problem, n_calls=n_calls, rng=rng)
+            return particles_from_posterior(fall_back(), n, problem, rng=rng)
         if all_at_once == 0.0:
             return replace(previous.with_zero_evidence(), strained=True)
         strained |= stuck
@@ -282,28 +282,24 @@ def resample_and_move(
     rows = resampled_rows(before.weight, n, rng)
     theta, log_likelihood = before.theta[rows], before.log_likelihood[rows]
     start = _EvaluatedSamples(theta, problem.prior.log_prob(theta), log_likelihood, log_likelihood.copy())
-    found = _moved_apart(start, before, problem, n_calls=before.n_calls, run=before.run, rng=rng, effort=effort)
+    found = _moved_apart(start, before, problem, n_calls=before.n_calls, rng=rng, effort=effort)
     lost, n_resampled = max(particles.lost_log_z, before.log_z - math.log(n)), particles.n_resampled + 1
     ancestor = particles.ancestor[rows]
     return replace(particles, weighted=found, ancestor=ancestor, n_resampled=n_resampled, lost_log_z=lost)
 
 
 def particles_from_posterior(
-    found: Weighted, n: int, problem: SequentialProblem, *, rng: np.random.Generator, effort: UpdateSettings = THOROUGH
+    found: Weighted | NestedResult,
+    n: int,
+    problem: SequentialProblem,
+    *,
+    rng: np.random.Generator,
+    effort: UpdateSettings = THOROUGH,
 ) -> Particles:
     """Restart with `n` samples resampled from a posterior and moved apart, with that posterior's evidence."""
     start = _EvaluatedSamples.of(found.theta[resampled_rows(found.weight, n, rng)], problem, 1.0)
-    drawn = _moved_apart(start, found, problem, n_calls=found.n_calls + n, run=found.run, rng=rng, effort=effort)
+    drawn = _moved_apart(start, found, problem, n_calls=found.n_calls + n, rng=rng, effort=effort)
     return Particles(drawn, np.arange(n), found.log_z_error**2)
-
-
-def particles_from_run(
-    run: NestedResult, n: int, problem: SequentialProblem, *, n_calls: int, rng: np.random.Generator
-) -> Particles:
-    """Start from a nested sampling run: resample `n` samples from it, and move them apart."""
-    start = _EvaluatedSamples.of(run.samples(n, rng=rng), problem, 1.0)
-    drawn = _moved_apart(start, run, problem, n_calls=n_calls + run.n_calls + n, run=run, rng=rng, effort=THOROUGH)
-    return Particles(drawn, np.arange(n), run.log_z_error**2)
 
 
 def _moved_apart(
@@ -312,11 +308,10 @@ def _moved_apart(
     problem: SequentialProblem,
     *,
     n_calls: int,
-    run: NestedResult | None,
     rng: np.random.Generator,
     effort: UpdateSettings,
 ) -> Weighted:
-    """Move samples, some of them copies; return them equally weighted, with the evidence of `found`."""
+    """Move samples, some of them copies; return them equally weighted, with the evidence and the run of `found`."""
     moved, _, n_moves = _move_by_metropolis(start, 1.0, problem, rng, [np.arange(len(start.theta))], effort)
     return evenly_weighted(
         found.names,
@@ -325,7 +320,7 @@ def _moved_apart(
         log_z=found.log_z,
         log_z_error=found.log_z_error,
         n_calls=n_calls + n_moves,
-        run=run,
+        run=found if isinstance(found, NestedResult) else found.run,
     )
 
 

@@ -345,19 +345,6 @@ def test_a_run_that_nothing_explains_does_not_call_itself_known(small):
     assert f"p = {result.last.p_value:.1g}" in result.stop_reason
 
 
-def test_a_sensor_that_sees_no_shape_is_refused_before_the_first_reading(small):
-    """No hypothesis predicts anything else than another: the map is flat."""
-
-    class Blind(small.sensor):
-        def predict(self, theta, plan):
-            return np.full((len(theta), len(plan.x_mm)), 10.0)
-
-    arm = small.arm()
-    with pytest.raises(ParameterError, match=r"utility is '0 everywhere'; allowed: one that differs between places"):
-        run(arm, small.experiment(model=Blind()), rng=rng())
-    assert arm.poses == []
-
-
 @pytest.mark.slow
 def test_several_readings_are_chosen_at_a_time(small):
     """Poses of a batch are those planned after its first reading, whatever they return."""

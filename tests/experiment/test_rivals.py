@@ -167,13 +167,6 @@ def test_readings_at_an_end_of_the_scale_cover_everything_beyond(name):
     assert total == pytest.approx(1.0, abs=3e-3)
 
 
-def test_a_step_says_what_may_be_left_out(stepped):
-    for info in stepped:
-        assert sum(info.left_out.values()) == pytest.approx(1.0)
-        assert info.left_out[""] > 0.5
-        assert 0 <= info.chance_off <= 1
-
-
 def test_the_result_holds_hypotheses_a_credible_set_and_a_sentence(doubting, stepped):
     document = json.loads(result_json(Exploration(doubting, tuple(stepped))))["left_out"]
     assert sum(h["probability"] for h in document["hypotheses"]) == pytest.approx(1.0)

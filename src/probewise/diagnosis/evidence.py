@@ -257,8 +257,7 @@ def refined(found: Fit, evidence: NoiseEvidence, *, least: float = -math.inf) ->
         return log_evidence_under(found, model.laws_at(settings, found.predicted), model.sd_prior)[0]
 
     while columns.size:
-        peak, sd = _peak_and_sds(log_density, start, spacing)
-        inside = (peak - _REACH * sd > 0) & (peak + _REACH * sd < 1)
+        peak, sd, inside = _peak_and_sds(log_density, start, spacing)
         if inside.all():
             break
         # At an end of its prior a parameter keeps the nodes that it has.
@@ -314,12 +313,14 @@ def _rise_between(marginal: FloatArray) -> float:
 
 def _peak_and_sds(
     log_density: Callable[[FloatArray], FloatArray], start: FloatArray, spacing: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return the peak of a density over the unit cube and its sd along each axis, (n_axes,) both.
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Return the peak of a density over the unit cube, its sd along each axis, and whether it is inside, (n_axes,) all.
 
-    Parabolas through three points along each axis lead to it; the points draw together from `spacing` to the sd.
+    Parabolas through three points along each axis lead to it; the points draw together from `spacing` to the sd. Along
+    an axis that leads out of the cube twice in turn the peak is at an end, and the search is over.
     """
-    center, step, eye = start, spacing, np.eye(len(start))
+    center, step, sd, eye = start, spacing, spacing, np.eye(len(start))
+    outside = np.zeros(len(start), dtype=np.bool_)
     for _ in range(_ROUNDS):
         center = np.clip(center, step + _EDGE, 1 - step - _EDGE)
         middle, *around = log_density(center + step * np.concatenate([0 * eye[:1], -eye, eye]))
@@ -331,11 +332,15 @@ def _peak_and_sds(
         bend = np.where(concave, bend, 1.0)
         sd = step / np.sqrt(bend)
         move = np.clip(np.where(concave, slope / bend, np.sign(slope)), -2.0, 2.0)
-        center = np.clip(center + move * step, _EDGE, 1 - _EDGE)
+        to, before = center + move * step, outside
+        outside = (to < _EDGE) | (to > 1 - _EDGE)
+        if (outside & before).any():
+            return center, sd, ~(outside & before)
+        center = np.clip(to, _EDGE, 1 - _EDGE)
         if np.all(np.abs(move) * step < 0.5 * sd) and np.all(step < 2 * sd):
             break
         step = np.where(concave, np.clip(sd, step / 8, step), step)
-    return center, sd
+    return center, sd, (center - _REACH * sd > 0) & (center + _REACH * sd < 1)
 
 
 def _nodes_about(effect: NoiseEffect, about: Mapping[int, tuple[float, float]]) -> tuple[FloatArray, FloatArray]:

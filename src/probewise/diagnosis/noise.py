@@ -97,19 +97,25 @@ class Tail:
         """Return minus the second derivative of the log likelihood by log sigma at its peak sigma, (k,), or a least."""
         squares = (whitened / sigma) ** 2
         wide = self.wide_probability(squares)
-        less = (1 - np.asarray(self.times) ** -2) ** 2 * np.sum(squares**2 * wide * (1 - wide), axis=0)
+        less = self._log_odds_and_excess[1] ** 2 * np.sum(squares**2 * wide * (1 - wide), axis=0)
         return np.asarray(np.maximum(2.0 * n_points - less, 0.2 * n_points))
 
     def wide_probability(self, squares: FloatArray) -> FloatArray:
         """Return the probability that a residual is from the wide component, from its square over sigma^2."""
         return np.asarray(expit(self._log_odds_of_wide(squares)))
 
-    def _log_odds_of_wide(self, squares: FloatArray) -> FloatArray:
+    @cached_property
+    def _log_odds_and_excess(self) -> tuple[FloatArray, FloatArray]:
+        """Log odds of a residual of 0 to be wide, and by how much less than a narrow one's its precision is."""
         share, times = np.asarray(self.share), np.asarray(self.times)
-        return np.asarray(np.log(share / (1 - share) / times) + 0.5 * (1 - times**-2) * squares)
+        return np.log(share / (1 - share) / times), 1 - times**-2.0
+
+    def _log_odds_of_wide(self, squares: FloatArray) -> FloatArray:
+        log_odds, excess = self._log_odds_and_excess
+        return np.asarray(log_odds + 0.5 * excess * squares)
 
     def _relative_precisions(self, squares: FloatArray) -> FloatArray:
-        return np.asarray(1 - (1 - np.asarray(self.times) ** -2) * self.wide_probability(squares))
+        return np.asarray(1 - self._log_odds_and_excess[1] * self.wide_probability(squares))
 
 
 @lru_cache(maxsize=256)
@@ -239,7 +245,7 @@ class NoiseLaw:
         """Number of readings that are neither lost nor censored."""
         return int(self._counted.sum())
 
-    @property
+    @cached_property
     def whitening_key(self) -> tuple[bytes, ...]:
         """Key of the whitening: distributions with the same key differ only in tails or rounding."""
         arrays = self.sd, self.carry, self.lost, self.walk, self.before

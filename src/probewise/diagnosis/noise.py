@@ -33,7 +33,7 @@ RUNS_AWAY = 1e100  # prediction or residual whose square overflows: it counts as
 LEAST_SCALE = 1e-150  # least sd, for readings that are exactly as predicted
 
 _LOG_ROOT_2_PI = 0.5 * math.log(2 * math.pi)
-_EM_STEPS = 12
+_SLOWEST = 0.7  # of a step of EM, the share that the next one may be for its limit to be taken
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,18 +59,28 @@ class Tail:
     def likeliest_sigma(
         self, whitened: FloatArray, n_points: int, *, floor: float = 0.0, start: FloatArray | None = None
     ) -> FloatArray:
-        """Return the most likely sigma, (k,), by EM."""
+        """Return the most likely sigma, (k,): pairs of steps of EM, each followed to its limit (Aitken's method)."""
         if self.is_normal:
             rms = np.sqrt(np.einsum("ij,ij->j", whitened, whitened) / n_points)
             return np.asarray(np.maximum(rms, max(floor, LEAST_SCALE)))
-        squares, sigma = whitened**2, start
+        squares = whitened**2
+
+        def improved(sigma: FloatArray) -> FloatArray:
+            weighed = self._relative_precisions(squares / sigma**2) * squares
+            return np.asarray(np.maximum(np.sqrt(weighed.sum(axis=0) / n_points), floor) + LEAST_SCALE)
+
+        sigma = start
         if sigma is None:  # from the interquartile range of the readings not lost, which is robust to the tail
             middle = len(whitened) - n_points // 2 - 1
             median = np.partition(np.abs(whitened), middle, axis=0)[middle]
-            sigma = np.maximum(median / MAD_OF_NORMAL, floor) + LEAST_SCALE
-        for _ in range(_EM_STEPS if start is None else 3):
-            weighed = self._relative_precisions(squares / sigma**2) * squares
-            sigma = np.maximum(np.sqrt(weighed.sum(axis=0) / n_points), floor) + LEAST_SCALE
+            sigma = improved(improved(np.maximum(median / MAD_OF_NORMAL, floor) + LEAST_SCALE))
+        for _ in range(2 if start is None else 1):
+            first = improved(sigma)
+            second = improved(first)
+            with np.errstate(all="ignore"):  # where nothing changes any more
+                before, last = np.log(first / sigma), np.log(second / first)
+                rate = np.clip(np.nan_to_num(last / before), 0.0, _SLOWEST)
+            sigma = np.maximum(second * np.exp(last * rate / (1 - rate)), floor)
         return np.asarray(sigma)
 
     def minus_log_likelihood(self, whitened: FloatArray, sigma: FloatArray, n_points: int) -> FloatArray:

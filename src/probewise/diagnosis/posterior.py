@@ -361,7 +361,7 @@ class FoldedNormal(StandardNormal):
 # If many predictions cost little, and else: draws of a round, kernels, rounds, effective draws that suffice.
 _SIZES = {True: (2000, 150, 20, 1000.0), False: (400, 20, 4, 250.0)}
 _PER_PRIOR = 20  # draws of a proposal for one of the prior
-_AS_IT_IS = 0.75  # effective share of the first draws from which no ridge is followed
+_AS_IT_IS = 0.3  # effective share of the first draws from which no ridge is followed
 _UNSURE_K = 0.7  # Pareto k from which the mean of the weights converges too slowly (Vehtari et al. 2024)
 _UNIFORM = 0.5  # effective share from which the weights have no tail, whatever k
 _SETTLED = 0.03, 0.05  # changes of the log evidence and, in their share, of the sds between two rounds
@@ -760,7 +760,7 @@ def surrogate_log_density(
 _N_WALKERS = 250
 _MOVES = 6  # of each walker after a step of beta
 # Of adaptive importance sampling where it costs little: draws of a round, kernels, rounds, and enough effective draws.
-_SIZES_HERE = 1000, 60, 20, 250.0
+_SIZES_HERE = 1000, 60, 8, 250.0
 # The surrogate costs next to nothing.
 _N_NEAR = 2000
 _MOVES_NEAR = 20

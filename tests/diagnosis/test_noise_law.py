@@ -65,6 +65,19 @@ def test_pseudo_residuals_say_as_much_as_the_density_does(share, times):
     assert np.abs(plain).max() < 10
 
 
+@pytest.mark.parametrize(("share", "times"), [(0.02, 8.0), (0.2, 2.5), (0.05, 30.0)])
+def test_the_scale_of_heavy_tailed_noise_is_at_the_peak_of_its_likelihood(share, times):
+    """Also of noise whose tail is another; from a scale 1 % off it comes four times as close."""
+    rng, law = np.random.default_rng(4), heavy(share, times)
+    z = rng.normal(size=(50, 40)) * np.where(rng.random((50, 40)) < 0.1, 6.0, 1.0)
+    sigma = law.likeliest_sigma(z)
+    best = law.minus_log_likelihood(z, sigma)
+    for factor in (0.99, 1.01):
+        assert (law.minus_log_likelihood(z, factor * sigma) > best).all()
+        again = law.whitened_density.likeliest_sigma(z, 50, start=factor * sigma)
+        np.testing.assert_allclose(again, sigma, rtol=0.0025)
+
+
 def test_readings_lost_to_one_value_are_no_wide_ones():
     rng = np.random.default_rng(5)
     noise = SD * rng.normal(size=N)

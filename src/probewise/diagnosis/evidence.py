@@ -316,11 +316,10 @@ def _peak_and_sds(
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Return the peak of a density over the unit cube, its sd along each axis, and whether it is inside, (n_axes,) all.
 
-    Parabolas through three points along each axis lead to it; the points draw together from `spacing` to the sd. Along
-    an axis that leads out of the cube twice in turn the peak is at an end, and the search is over.
+    Parabolas through three points along each axis lead to it; the points draw together from `spacing` to the sd. Where
+    one of them is at an end of an axis and the parabola leads beyond, the peak is at the end, and the search is over.
     """
     center, step, sd, eye = start, spacing, spacing, np.eye(len(start))
-    outside = np.zeros(len(start), dtype=np.bool_)
     for _ in range(_ROUNDS):
         center = np.clip(center, step + _EDGE, 1 - step - _EDGE)
         middle, *around = log_density(center + step * np.concatenate([0 * eye[:1], -eye, eye]))
@@ -332,10 +331,10 @@ def _peak_and_sds(
         bend = np.where(concave, bend, 1.0)
         sd = step / np.sqrt(bend)
         move = np.clip(np.where(concave, slope / bend, np.sign(slope)), -2.0, 2.0)
-        to, before = center + move * step, outside
-        outside = (to < _EDGE) | (to > 1 - _EDGE)
-        if (outside & before).any():
-            return center, sd, ~(outside & before)
+        to = center + move * step
+        ended = (to < _EDGE) & (center - step < 2 * _EDGE) | (to > 1 - _EDGE) & (center + step > 1 - 2 * _EDGE)
+        if ended.any():
+            return center, sd, ~ended
         center = np.clip(to, _EDGE, 1 - _EDGE)
         if np.all(np.abs(move) * step < 0.5 * sd) and np.all(step < 2 * sd):
             break

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Self
 
 import numpy as np
@@ -115,17 +115,23 @@ class PriorOdds:
             log_p += math.log(share * self.out_of_vocabulary / (n_as_likely - k))
         return log_p + len(self.unlikely.intersection(names)) * math.log(self.unlikely_weight)
 
-    def _log_prior_per_combination(self, n: int) -> float:
-        if not n:
-            return math.log(self.clean_mean)
-        # A model of chosen effects may have more of them than a diagnosis would combine.
+    @cached_property
+    def _log_prior_per_combination(self) -> Callable[[int], float]:
         n_unlikely = len(self.unlikely) - self._n_unlikely_unnamed
-        # The sum over combinations of the product of their effects' weights.
-        combinations = sum(
-            math.comb(self.n_named - n_unlikely, n - k) * math.comb(n_unlikely, k) * self.unlikely_weight**k
-            for k in range(n + 1)
-        )
-        return math.log(self.by_size[min(n, len(self.by_size)) - 1] / combinations)
+
+        @cache
+        def log_prior(n: int) -> float:
+            if not n:
+                return math.log(self.clean_mean)
+            # The sum over combinations of the product of their effects' weights.
+            combinations = sum(
+                math.comb(self.n_named - n_unlikely, n - k) * math.comb(n_unlikely, k) * self.unlikely_weight**k
+                for k in range(n + 1)
+            )
+            # A model of chosen effects may have more of them than a diagnosis would combine.
+            return math.log(self.by_size[min(n, len(self.by_size)) - 1] / combinations)
+
+        return log_prior
 
     @cached_property
     def _n_unlikely_unnamed(self) -> int:

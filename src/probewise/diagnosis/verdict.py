@@ -98,7 +98,8 @@ def shared_effects(probabilities: Mapping[Names, float]) -> Names:
     for names, p in probabilities.items():
         for name in names if names != UNKNOWN else ():
             of_effect[name] = of_effect.get(name, 0.0) + p
-    for name in sorted(of_effect, key=lambda name: (-of_effect[name], name)):  # the most probable first
+    likely = [name for name, p in of_effect.items() if total - p <= OUT_OF_THE_QUESTION * p]
+    for name in sorted(likely, key=lambda name: (-of_effect[name], name)):  # the most probable first
         with_all = sum(p for names, p in probabilities.items() if shared | {name} <= {*names})
         if total - with_all <= OUT_OF_THE_QUESTION * with_all:
             shared |= {name}

@@ -519,9 +519,13 @@ class NoiseEffect(Effect):
 def sentence_from_samples(effect: Effect, samples: FloatArray) -> str:
     """Describe an effect by samples of its parameters, (n_samples, n_params), and its origin, if that is not 0.
 
-    Of an amplitude with samples on both sides of 0, but hardly any near it, it says between what values it lies.
+    Of an amplitude with samples on both sides of 0, but hardly any near it, it says between what values it lies. Values
+    of runs are told from their median.
     """
-    sentence = effect.sentence(*mean_and_sd_of_samples(samples))
+    said = samples
+    if effect.covariates == ("run",) and effect.stage is not Stage.NOISE:  # a parameter may take up what all share
+        said = samples - np.median(samples, axis=1, keepdims=True)
+    sentence = effect.sentence(*mean_and_sd_of_samples(said))
     for k in effect.amplitudes:
         positive, sizes = np.mean(samples[:, k] > 0), np.abs(samples[:, k])
         near = np.mean(sizes < _NEAR_ZERO * np.median(sizes))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from probewise.effects import is_out_of_vocabulary
+from probewise.effects.effect import sentence_from_samples
 from probewise.systems import Extra, Law, Noise, RunTable, Simulator, System
 from probewise.systems.forms import ReferenceFit, bind_forms
 from probewise.systems.forms.formulas import formula_forms
@@ -489,3 +490,10 @@ def test_a_share_of_the_reading_fades_from_the_start_of_each_run():
     since = np.concatenate([_T[rows] - _T[rows][0] for rows in (slice(0, N_ROWS // 2), slice(N_ROWS // 2, N_ROWS))])
     found = form.apply(y, np.array([[0.2, 1.5]]), TABLE)[0]
     np.testing.assert_allclose(found, y[0] * (1 + 0.2 * np.exp(-since / 1.5)))
+
+
+def test_what_differs_from_run_to_run_is_told_from_the_median_of_the_runs():
+    """Of an offset that a parameter takes up, all runs together are known to 0.7 V, their difference to 0.01 V."""
+    rng = np.random.default_rng(3)
+    values = 0.7 * rng.standard_normal((2000, 1)) + [0.2, -0.2] + 0.01 * rng.standard_normal((2000, 2))
+    assert "in run 1: by 0.2000 ± 0.007" in sentence_from_samples(FORMS["offset_per_run"], values)

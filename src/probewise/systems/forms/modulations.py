@@ -291,7 +291,7 @@ def form_per_run(about: ReferenceFit, name: str, of: Quantity) -> Iterator[Effec
     def says(mean: FloatArray, sd: FloatArray) -> str:
         far = int(np.argmax(np.abs(mean)))
         by = value_with_sd(mean[far], sd[far], of.unit)
-        return f"{of.what} differs from run to run, most in run {names[far]}: by {by}"
+        return f"{of.what} differs from run to run, most in run {names[far]}: by {by} from their median"
 
     parameters: Declared = {f"values[{name}]": (AMPLITUDE, of.unit) for name in names}
     for form in of.varying(about, name, at_rows, parameters, ("run",), says):

@@ -1,7 +1,6 @@
 """Results made by hand: of cases, with all said rightly unless a test says otherwise, and of runs of a study."""
 
 import numpy as np
-import pytest
 
 
 def hidden(name, size=8.0, *, cosines=None, on_noise=False, in_vocabulary=True, shows_in=("time",)):
@@ -87,15 +86,3 @@ def single(name="lag", size=8.0, *, hide=None, **others):
 def outside(size=12.0, *, name="chirp", cosines=None, **others):
     like = hidden(name, size, cosines=cosines or {}, in_vocabulary=False)
     return case("outside", size, truth=["unknown"], hides=[like], **others)
-
-
-@pytest.fixture
-def make():
-    """Return the makers by their names, such as `make.case`."""
-
-    class Make:
-        pass
-
-    for maker in (case, single, outside, hidden, system_case, system_single, search):
-        setattr(Make, maker.__name__, staticmethod(maker))
-    return Make

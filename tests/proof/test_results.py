@@ -12,7 +12,7 @@ from probewise.proof.challenge import Task
 from probewise.proof.concealed_study import ConcealedTrial
 from probewise.proof.study import REFERENCE, Trial
 
-from .conftest import search
+from .conftest import case, hidden, search, single
 
 RUN = {"readings": 3, "error_mm": 1.0, "chance_wrong": 0.01, "held": [True, True, False]}
 SEARCH = search(3, p_value=None)
@@ -32,11 +32,11 @@ def damaged(value, path="result"):
 
 
 @pytest.mark.parametrize("kind", ["trial", "concealed trial", "case"])
-def test_every_part_that_is_of_another_type_or_missing_is_named(kind, make):
+def test_every_part_that_is_of_another_type_or_missing_is_named(kind):
     whole, schema = {
         "trial": (SEARCH, TRIAL),
         "concealed trial": (HIDDEN, CONCEALED_TRIAL),
-        "case": (make.single(cosine=0.2), SENSOR_CASE),
+        "case": (single(cosine=0.2), SENSOR_CASE),
     }[kind]
     assert misfit(whole, schema) is None
     for path, result in damaged(whole):
@@ -48,12 +48,10 @@ def test_every_part_that_is_of_another_type_or_missing_is_named(kind, make):
         assert misfit(less, schema)[0] == f"result.{key} is missing"
 
 
-def test_a_case_conceals_as_many_effects_as_its_kind_says(make):
-    assert misfit_of_case(make.single(), SENSOR_CASE) is None
-    assert (
-        misfit_of_case(make.case("pair", hides=[make.hidden("lag")]), SENSOR_CASE)[0] == "result.hidden has 1 of them"
-    )
-    assert "cosine" in misfit_of_case(make.case("alias", hides=[make.hidden("lag")]), SENSOR_CASE)[0]
+def test_a_case_conceals_as_many_effects_as_its_kind_says():
+    assert misfit_of_case(single(), SENSOR_CASE) is None
+    assert misfit_of_case(case("pair", hides=[hidden("lag")]), SENSOR_CASE)[0] == "result.hidden has 1 of them"
+    assert "cosine" in misfit_of_case(case("alias", hides=[hidden("lag")]), SENSOR_CASE)[0]
 
 
 FILES = {
@@ -69,9 +67,9 @@ FILES = {
 
 
 @pytest.mark.parametrize("command", FILES)
-def test_a_damaged_result_ends_the_verb_in_one_line(command, make, tmp_path, capsys):
+def test_a_damaged_result_ends_the_verb_in_one_line(command, tmp_path, capsys):
     name, key, tasks, result = FILES[command]
-    result = make.single() if result is None else result
+    result = single() if result is None else result
     settings = {key: __version__} | ({"seed": 5} if key == "challenge" else {"max_readings": 100})
     lines = [{"format": "campaign/1", "settings": settings | ({"seed": 2013} if key == "concealed" else {})}]
     lines += [{"key": task, "result": result} for task in tasks]

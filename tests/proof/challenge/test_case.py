@@ -9,9 +9,11 @@ from probewise.proof.challenge import Task, challenge, run_case
 from probewise.proof.sensors import stratum_of
 from probewise.proof.tables import score
 
+from ..conftest import case, single
+
 
 @pytest.fixture
-def file_of(tmp_path, make):
+def file_of(tmp_path):
     """Write a campaign's file of cases made by hand."""
 
     def write(results, seed=3, version=None):
@@ -27,14 +29,14 @@ def file_of(tmp_path, make):
     return write
 
 
-def test_what_a_file_holds_is_not_done_again(file_of, make):
-    results = [make.case(), make.single()]
+def test_what_a_file_holds_is_not_done_again(file_of):
+    results = [case(), single()]
     assert list(challenge(range(2), seed=3).run(path=file_of(results)).values()) == results
 
 
-def test_another_version_s_cases_are_not_mixed_in(file_of, make):
+def test_another_version_s_cases_are_not_mixed_in(file_of):
     with pytest.raises(FileError, match="other settings"):
-        challenge([0], seed=3).run(path=file_of([make.case()], version="0.0"))
+        challenge([0], seed=3).run(path=file_of([case()], version="0.0"))
 
 
 def test_a_case_that_cannot_be_drawn_is_noted(monkeypatch):

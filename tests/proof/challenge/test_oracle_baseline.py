@@ -12,8 +12,10 @@ from probewise.proof.tables import (
     readings_to_separate_alias,
 )
 
+from ..conftest import case, hidden
 
-def hidden(size, **cosines):
+
+def lag(size, **cosines):
     return {"name": "lag", "size_lambda": size, "in_vocabulary": True, "cosines": {"lag": 1.0, **cosines}}
 
 
@@ -26,29 +28,29 @@ def test_one_rival_is_told_as_often_as_the_nearer_of_two_points():
     rival = np.linalg.lstsq(way[:, None], own, rcond=None)[0] * way
     read = own + rng.standard_normal((200_000, 2))
     right = np.linalg.norm(read - own, axis=1) < np.linalg.norm(read - rival, axis=1)
-    assert oracle_name_rate(hidden(size, halo=rho)) == pytest.approx(right.mean(), abs=0.003)
+    assert oracle_name_rate(lag(size, halo=rho)) == pytest.approx(right.mean(), abs=0.003)
 
 
 def test_the_hardest_rival_that_is_wrong_counts():
     # At lambda 8 a cosine of .99 leaves less than three nats: that name is right too.
-    assert oracle_name_rate(hidden(8.0, backlash=0.99)) == 1.0
-    hard = oracle_name_rate(hidden(8.0, halo=0.9))
-    assert oracle_name_rate(hidden(8.0, backlash=0.99, halo=0.9, glint=0.6)) == hard < 1
+    assert oracle_name_rate(lag(8.0, backlash=0.99)) == 1.0
+    hard = oracle_name_rate(lag(8.0, halo=0.9))
+    assert oracle_name_rate(lag(8.0, backlash=0.99, halo=0.9, glint=0.6)) == hard < 1
 
 
 def test_a_rival_that_shows_in_the_same_is_no_other_place():
     shown = {"shows_in": ["slope", "direction"]}
-    assert oracle_covariate_rate({**hidden(8.0, backlash=1.0), **shown}) == 1.0
+    assert oracle_covariate_rate({**lag(8.0, backlash=1.0), **shown}) == 1.0
     # A rival in another covariate that leaves the same trace is taken for it every other time.
-    assert oracle_covariate_rate({**hidden(8.0, nonlinearity=1.0), **shown}) == 0.5
-    assert 0.9 < oracle_covariate_rate({**hidden(8.0, nonlinearity=0.9), **shown}) < 1.0
+    assert oracle_covariate_rate({**lag(8.0, nonlinearity=1.0), **shown}) == 0.5
+    assert 0.9 < oracle_covariate_rate({**lag(8.0, nonlinearity=0.9), **shown}) < 1.0
 
 
 def test_the_set_holds_one_where_nothing_is_alike_and_aliases_count_once():
-    assert oracle_credible_set_size(hidden(8.0)) == 1.0
-    assert oracle_credible_set_size(hidden(8.0, backlash=1.0)) == 1.0
-    assert 1.0 < oracle_credible_set_size(hidden(8.0, halo=0.92)) < 2.0
-    assert oracle_credible_set_size(hidden(8.0, halo=0.5)) == pytest.approx(1.0, abs=0.01)
+    assert oracle_credible_set_size(lag(8.0)) == 1.0
+    assert oracle_credible_set_size(lag(8.0, backlash=1.0)) == 1.0
+    assert 1.0 < oracle_credible_set_size(lag(8.0, halo=0.92)) < 2.0
+    assert oracle_credible_set_size(lag(8.0, halo=0.5)) == pytest.approx(1.0, abs=0.01)
 
 
 def test_two_names_three_nats_apart_are_held_together_as_often_as_the_normal_law_says():
@@ -58,11 +60,11 @@ def test_two_names_three_nats_apart_are_held_together_as_often_as_the_normal_law
     rng = np.random.default_rng(4)
     log_odds = d**2 / 2 + d * rng.standard_normal(400_000)
     alone = np.abs(log_odds) > math.log(19)
-    like = {**hidden(size, halo=rho)}
+    like = {**lag(size, halo=rho)}
     assert oracle_credible_set_size(like) == pytest.approx(2 - alone.mean(), abs=0.06)
 
 
-def test_no_number_of_repeated_plans_parts_two_that_agree(make):
-    alias = make.case("alias", 12.0, truth=["lag"], hides=[make.hidden("lag", 12.0)], cosine=-1.0)
+def test_no_number_of_repeated_plans_parts_two_that_agree():
+    alias = case("alias", 12.0, truth=["lag"], hides=[hidden("lag", 12.0)], cosine=-1.0)
     assert readings_to_separate_alias(alias) == math.inf
     assert readings_to_separate_alias(alias | {"cosine": 0.5}) == pytest.approx(408 * 3 / 54)

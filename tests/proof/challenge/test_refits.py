@@ -14,6 +14,8 @@ from probewise.world.concealed import ambient_step, halo
 from probewise.world.spots import Blob, gaussian_spot
 from probewise.world.world import World
 
+from ..conftest import hidden, single
+
 
 @pytest.fixture(scope="module")
 def world():
@@ -70,8 +72,8 @@ def test_a_skirt_about_a_gaussian_spot_is_one_gaussian_more(refit, world, plan, 
     assert "ssf_order" not in cosines_with_vocabulary(refit, clean, step)
 
 
-def test_an_alarm_is_due_on_physics_alone(make):
-    like = make.hidden("halo", cosines={"halo": 1.0, "ssf_order": 0.999})
-    results = [make.single("halo", hide=like, p_value=0.7), make.single("lag", p_value=1e-5)]
+def test_an_alarm_is_due_on_physics_alone():
+    like = hidden("halo", cosines={"halo": 1.0, "ssf_order": 0.999})
+    results = [single("halo", hide=like, p_value=0.7), single("lag", p_value=1e-5)]
     (found,) = (row for row in score(results) if row.name == "detection, alpha .01, lambda 8")
     assert (found.found.value, found.found.n) == (1.0, 1)

@@ -10,11 +10,13 @@ from probewise.proof.challenge import Task
 from probewise.proof.tables import confusion_counts, reliability_bins, score
 from probewise.report.html import draw_or_raise
 
+from ..conftest import case, outside, single
+
 
 @pytest.fixture
-def results(make):
+def results():
     failed = {"kind": "pair", "size": 12.0, "other_noise": False, "failed": "no <plan>", "at": "drawing"}
-    return [make.case(), make.case(p=0.6), make.single(), make.single(said=["halo"]), make.outside(), failed]
+    return [case(), case(p=0.6), single(), single(said=["halo"]), outside(), failed]
 
 
 def test_the_answer_counts_targets(results):

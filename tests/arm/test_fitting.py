@@ -110,6 +110,10 @@ def test_marks_that_do_not_determine_the_geometry_are_refused():
     turned, places = touched(built(), marks=near)
     with pytest.raises(ParameterError, match=r"6 that leave the height open.*near and far from the base"):
         fit_geometry(GEOMETRY, turned, places)
+    seen, places = touched(built())
+    places[:, 2] = np.nan
+    with pytest.raises(ParameterError, match=r"8 that leave the height open to \d\d.\d mm and the place to 1.\d mm"):
+        fit_geometry(GEOMETRY, seen, places)
     with pytest.raises(ParameterError, match="marks is 4; allowed: 5 or more"):
         fit_geometry(GEOMETRY, turned[:4], places[:4])
 

@@ -113,6 +113,7 @@ def test_leaving_the_block_brings_the_arm_to_rest_after_an_exception_too():
         (lambda: Reach(farthest_mm=np.inf), ParameterError, "farthest_mm is inf"),
         (lambda: Reach(nearest_mm=800.0), ParameterError, "less than farthest_mm"),
         (lambda: Speed(move_mm_s=0.0), ParameterError, "move_mm_s"),
+        (lambda: Speed(read_s=-1.0), ParameterError, "read_s is -1.0"),
         (lambda: ReadingScale(step=0.0), ParameterError, "step"),
         (lambda: SimulatedArm(flat(1.0), height_mm=0.0), ParameterError, "height_mm"),
         (lambda: SimulatedArm(flat(1.0)).reachable(np.zeros(3)), ShapeError, "n_places, 2"),

@@ -5,27 +5,16 @@ import stat
 import subprocess
 import sys
 import threading
-from pathlib import Path
 
 import pytest
+from command import content_of, refused, run
 from heater import fitted
 
 from probewise._writing import staged_output
-from probewise.cli import main
 from probewise.errors import FileError
 from probewise.recordings import read_recording, write_bytes_atomically, write_recording
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="Windows has no named pipes, and links for administrators only")
-
-
-def contents(folder):
-    """Return what is in a folder, by name, without following a link."""
-    found = {}
-    for at, folders, names in os.walk(folder):
-        for path in (Path(at, name) for name in (*folders, *names)):
-            name = path.relative_to(folder).as_posix()
-            found[name] = os.readlink(path) if path.is_symlink() else path.read_text() if path.is_file() else None
-    return found
 
 
 def nested(out):
@@ -105,7 +94,7 @@ def test_nothing_outside_a_hostile_folder_changes_and_the_way_out_is_said(build,
         assert named.startswith(f"{out}/")
         subprocess.run(["rm", "-r", named], check=True)
         write()
-    assert contents(outside) == {"victim.txt": "precious"}
+    assert content_of(outside) == {"victim.txt": b"precious"}
     assert (out / "report.html").read_text() == "new"
     assert not (out / "report.html").is_symlink()
 
@@ -117,7 +106,7 @@ def test_an_input_that_has_the_name_of_a_hidden_folder_is_kept(tmp_path):
         staged_output(tmp_path, inputs=[tmp_path / ".probewise-writing"]),
     ):
         pass
-    assert contents(tmp_path) == {".probewise-writing": "precious", ".results.lock": ""}
+    assert content_of(tmp_path) == {".probewise-writing": b"precious"}
 
 
 LINKS = {
@@ -146,60 +135,55 @@ def test_a_link_or_a_pipe_where_a_run_would_write_is_refused_before_it_begins(
         (out / name).symlink_to(tmp_path / "victim")
     words = {"explore": ["--sensor", str(sensor_file)], "investigate": ["--plan", "paper", "--rounds", "1"]}
     more = [resume] if resume and verb in words else []
-    assert main([verb, *words.get(verb, []), *more, "--quiet", "--out", str(out)]) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
+    said = refused(capsys, tmp_path, verb, *words.get(verb, []), *more, "--quiet", "--out", out)
     assert f"{out / name}: " in said
     assert says in said
-    assert (tmp_path / "victim").read_text() == "precious"
 
 
 def test_a_persons_folder_of_the_name_of_a_runs_is_left_alone(sensor_file, tmp_path, capsys):
     mine = tmp_path / "out" / "rounds" / "1.csv"
     mine.parent.mkdir(parents=True)
     mine.write_text("mine")
-    words = ["investigate", "--plan", "paper", "--rounds", "1", "--sensor", str(sensor_file)]
-    assert main([*words, "--out", str(tmp_path / "out")]) == 2
-    assert f"{mine.parent}: " in capsys.readouterr().err
-    assert contents(tmp_path / "out") == {"rounds": None, "rounds/1.csv": "mine"}
+    words = ("investigate", "--plan", "paper", "--rounds", "1", "--sensor", sensor_file, "--out", tmp_path / "out")
+    assert f"{mine.parent}: " in refused(capsys, tmp_path, *words)
 
 
 def predict(sensor_file, recording_file, out):
-    return main(["predict", str(sensor_file), str(recording_file), "--quiet", "--out", str(out)])
+    return run("predict", sensor_file, recording_file, "--quiet", "--out", out)
 
 
 def check(sensor_file, recording_file, out):
-    return main(["arm", "check", "--quiet", "--out", str(out)])
+    return run("arm", "check", "--quiet", "--out", out)
 
 
-@pytest.mark.parametrize("run", [predict, check])
+@pytest.mark.parametrize("write", [predict, check])
 def test_a_pipe_and_a_device_are_written_to_a_link_is_followed_and_a_folder_is_refused(
-    run, sensor_file, recording_file, tmp_path, capsys
+    write, sensor_file, recording_file, tmp_path, capsys
 ):
     plain, pipe, folder = tmp_path / "plain.csv", tmp_path / "pipe", tmp_path / "folder"
-    assert run(sensor_file, recording_file, plain) == 0
+    assert write(sensor_file, recording_file, plain) == 0
     os.mkfifo(pipe)
     heard = []
     reader = threading.Thread(target=lambda: heard.append(pipe.read_bytes()), daemon=True)
     reader.start()
-    assert run(sensor_file, recording_file, pipe) == 0
+    assert write(sensor_file, recording_file, pipe) == 0
     reader.join(10)
     assert heard == [plain.read_bytes()]
     assert stat.S_ISFIFO(pipe.stat().st_mode)
     assert not list(tmp_path.glob("pipe?*"))
     (tmp_path / "link.csv").symlink_to("elsewhere.csv")
-    assert run(sensor_file, recording_file, tmp_path / "link.csv") == 0
+    assert write(sensor_file, recording_file, tmp_path / "link.csv") == 0
     assert (tmp_path / "link.csv").is_symlink()
     assert len((tmp_path / "elsewhere.csv").read_bytes()) == len(heard[0])
     folder.mkdir()
-    assert run(sensor_file, recording_file, folder) == 2
+    assert write(sensor_file, recording_file, folder) == 2
     assert "this is a directory" in capsys.readouterr().err
     try:
         os.mknod(tmp_path / "null", stat.S_IFCHR | 0o666, os.makedev(1, 3))
         (tmp_path / "null").open("wb").close()
     except OSError:
         return  # only root makes devices, and not on every file system
-    assert run(sensor_file, recording_file, tmp_path / "null") == 0
+    assert write(sensor_file, recording_file, tmp_path / "null") == 0
     assert stat.S_ISCHR((tmp_path / "null").stat().st_mode)
 
 
@@ -225,9 +209,9 @@ def test_a_changed_simulator_is_refused_and_not_run(tmp_path, capsys):
     (tmp_path / "fitted.json").write_text(fitted().to_json())
     (tmp_path / "heater.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\n")
     (tmp_path / "table.csv").write_text("time_s\n1\n")
-    words = ["predict", tmp_path / "fitted.json", tmp_path / "table.csv", "--simulator", tmp_path / "heater.py"]
-    assert main([str(word) for word in (*words, "--out", tmp_path / "p.csv")]) == 2
-    assert "fingerprint abc; allowed: that file unchanged" in capsys.readouterr().err
+    words = ("predict", tmp_path / "fitted.json", tmp_path / "table.csv", "--simulator", tmp_path / "heater.py")
+    said = refused(capsys, tmp_path, *words, "--out", tmp_path / "p.csv")
+    assert "fingerprint abc; allowed: that file unchanged" in said
     assert not (tmp_path / "ran").exists()
 
 
@@ -265,7 +249,7 @@ def test_control_characters_of_names_do_not_reach_the_terminal(sensor_file, reco
         (2, ("explore", "--sensor", sensor_file, "--arm", f"{name}.py", "--out", folder / "out")),
         (0, ("audit", recording)),
     ]:
-        assert main([str(word) for word in words]) == status
+        assert run(*words) == status
         said = capsys.readouterr()
         assert all(line.isprintable() for line in (said.out + said.err).split("\n")), words
 
@@ -276,6 +260,6 @@ def test_results_of_files_whose_names_are_no_utf_8_are_written_and_read_back(rec
         'reading, unit, parameters = "y", "V", {"a": (0, 10)}\ndef simulate(p, data):\n    return p["a"] * data["x"]\n'
     )
     given = (tmp_path / "\udcff.csv", "--simulator", tmp_path / "\udcff.py", "--quiet", "--out")
-    assert main([str(word) for word in ("fit", *given, tmp_path / "out")]) == 0
-    assert main([str(word) for word in ("predict", tmp_path / "out" / "fitted.json", *given, tmp_path / "p.csv")]) == 0
+    assert run("fit", *given, tmp_path / "out") == 0
+    assert run("predict", tmp_path / "out" / "fitted.json", *given, tmp_path / "p.csv") == 0
     assert "\\udcff.csv" in (tmp_path / "out" / "report.html").read_text()

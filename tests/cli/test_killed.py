@@ -10,6 +10,7 @@ import threading
 import time
 
 import pytest
+from command import content_of
 
 from probewise.cli import main
 
@@ -17,10 +18,6 @@ from probewise.cli import main
 def command(sensor_file, out, *more):
     where = ("--sensor", sensor_file, "--truth", "500,250,90", "--out", out, "--seed", 3, "--quiet")
     return [str(word) for word in ("explore", *where, "--max-readings", 4, *more)]
-
-
-def contents(out):
-    return {p.relative_to(out).as_posix(): p.read_bytes() for p in out.rglob("*") if p.is_file()}
 
 
 @pytest.mark.slow
@@ -41,7 +38,7 @@ def test_a_resumed_run_is_byte_for_byte_the_one_that_was_never_interrupted(
         (out / "journal.jsonl").write_bytes(whole[:cut])
         assert main(command(sensor_file, out, *more, "--resume")) == 0
         assert (out / "journal.jsonl").read_bytes() == whole, cut
-        assert contents(out) == contents(tmp_path / "whole") or cut == cuts[-1]  # which notes the torn line
+        assert content_of(out) == content_of(tmp_path / "whole") or cut == cuts[-1]  # which notes the torn line
 
 
 @pytest.mark.slow
@@ -74,7 +71,7 @@ def test_kill_9_at_random_moments_changes_nothing_of_the_outcome(sensor_file, tm
     began_s = time.monotonic()
     run = [sys.executable, "-m", "probewise"]
     subprocess.run([*run, *command(sensor_file, tmp_path / "whole")], check=True)
-    whole_s, whole = time.monotonic() - began_s, contents(tmp_path / "whole")
+    whole_s, whole = time.monotonic() - began_s, content_of(tmp_path / "whole")
     chance = random.Random(int(os.environ.get("PROBEWISE_KILL_SEED", "1")))
     n_killed = 0
     for k in range(9):  # a machine that has become faster ends more runs before they are killed
@@ -90,7 +87,7 @@ def test_kill_9_at_random_moments_changes_nothing_of_the_outcome(sensor_file, tm
             killer.cancel()
             assert status in (0, -signal.SIGKILL)
             n_killed += status != 0
-        found = contents(out)
+        found = content_of(out)
         notes = {"report.html"} if b"torn" in found["report.html"] else set()
         assert {n: c for n, c in found.items() if n not in notes} == {n: c for n, c in whole.items() if n not in notes}
         if n_killed == 2:

@@ -7,14 +7,7 @@ import numpy as np
 import pytest
 
 from probewise.arm import shipped_geometry_path
-from probewise.emulator import (
-    EmulatedArm,
-    LightModel,
-    SensorPose,
-    Tabletop,
-    parse_scene,
-    read_geometry,
-)
+from probewise.emulator import EmulatedArm, LightModel, SensorPose, Tabletop, parse_scene, read_geometry
 from probewise.errors import ParameterError
 from probewise.recordings import Disc, HalfPlane, Polygon, Quadrant, Uniform
 from probewise.world import Blob, Oval, World, gaussian_spot

@@ -288,12 +288,7 @@ def set_up_bench(
     sensors: list[Sensor] = [empty_port] * 4
     sensors[numbers["sensor"]["port"] - 1] = LightSensor(light, clock)
     brick = Brick(
-        clock,
-        motors=arm.motors(),
-        sensors=sensors,
-        sag_mv_min=faults.sag,
-        sleep_min=sleep_min,
-        watch=arm.record_lowest,
+        clock, motors=arm.motors(), sensors=sensors, sag_mv_min=faults.sag, sleep_min=sleep_min, watch=arm.record_lowest
     )
     rng = np.random.default_rng([seed, 1])
     return EmulatedBench(table, arm, Radio(brick, clock, rng=rng, faults=faults, trace=trace))

@@ -238,11 +238,9 @@ def times_to_numbers(name: str, values: ArrayLike, unit: str = "s") -> tuple[Arr
     a cell is missing or can be read in several ways, or some dates have a time zone and others none.
     """
     array = array_or_none(values)
-    if array is None:
+    if array is None or array.ndim != 1 or array.dtype.kind not in "OUmM" or not array.size:
         return values, ""
-    cells = array.tolist() if array.ndim == 1 and array.dtype.kind in "OUmM" else []
-    if not cells:
-        return values, ""
+    cells = array.tolist()
     try:
         if array.dtype.kind in "mM" and not np.isnat(array).any():
             if array.dtype.kind == "M" and np.datetime_data(array.dtype)[0] in "YM":
@@ -334,22 +332,21 @@ def _seconds_of_dates(parts: Sequence[dict[str, Any]]) -> tuple[FloatArray, str]
             digits = zone[1:].replace(":", "").ljust(4, "0")
             clocks[k] -= float(f"{zone[0]}1") * (3600.0 * int(digits[:2]) + 60.0 * int(digits[2:]))
     if "a" not in parts[0]:
-        days = _days(((p["y"], p["m"], p["d"]) for p in parts), strict=True)
-        return _DAY * (days - days[0]) + clocks, ""
-    if any(p["b"].isalpha() for p in parts):
+        orders = {"": [(p["y"], p["m"], p["d"]) for p in parts]}
+    elif any(p["b"].isalpha() for p in parts):
         months = {month: number for number, month in enumerate(_MONTHS, 1)}
-        days = _days(((p["y"], months.get(p["b"][:3].lower(), 0), p["a"]) for p in parts), strict=True)
-        return _DAY * (days - days[0]) + clocks, ""
-    day_first = _days((p["y"], p["b"], p["a"]) for p in parts)
-    month_first = _days((p["y"], p["a"], p["b"]) for p in parts)
-    either = [days - days[0] for days in (day_first, month_first) if days.size]
-    if len(either) == 2 and (either[0] != either[1]).any():
-        k = int(np.argmax(either[0] != either[1]))
+        orders = {"": [(p["y"], months.get(p["b"][:3].lower(), 0), p["a"]) for p in parts]}
+    else:
+        orders = {", day first": [(p["y"], p["b"], p["a"]) for p in parts]}
+        orders[", month first"] = [(p["y"], p["a"], p["b"]) for p in parts]
+    read = [(days - days[0], said) for said, dates in orders.items() if (days := _days(dates)).size]
+    if not read:
+        _days(next(iter(orders.values())), strict=True)
+    days, said = read[0]
+    if len(read) > 1 and (differ := days != read[1][0]).any():
+        k = int(np.argmax(differ))
         raise UnclearCellError(k, "year first (2026-11-28): day and month cannot be told apart, as no day is above 12")
-    if not either:
-        _days(((p["y"], p["b"], p["a"]) for p in parts), strict=True)
-    order = "" if len(either) == 2 else ", day first" if day_first.size else ", month first"
-    return _DAY * either[0] + clocks, order
+    return _DAY * days + clocks, said if len(read) == 1 else ""
 
 
 def _days(dates: Iterable[tuple[Any, Any, Any]], *, strict: bool = False) -> FloatArray:

@@ -46,14 +46,7 @@ from probewise.recordings.io import (
 )
 from probewise.recordings.patterns import PATTERNS, Image, Pattern
 from probewise.recordings.plan import Instrumentation, Plan, Recording, range_in_words, require_plan, require_recording
-from probewise.recordings.table import (
-    LARGEST_PLACE_MM,
-    CSVTable,
-    cell_in_words,
-    csv_text,
-    number_text,
-    read_table,
-)
+from probewise.recordings.table import LARGEST_PLACE_MM, CSVTable, cell_in_words, csv_text, number_text, read_table
 
 FORMAT = "recording/1"
 _A_NAME = "a printable text without blanks around it"

@@ -62,14 +62,12 @@ def sight(stand, clock, *, albedo=1.0):
     return LightModel(world, Tabletop(Uniform(albedo)), lambda: stand, read_height_mm=14.0, seed=3, clock=clock)
 
 
-def test_at_the_reading_height_the_brick_shows_what_the_world_reads(clock):
-    assert sight(SensorPose(0, 0, 14.0, 0), clock)(True) == pytest.approx(60.5)
-    assert sight(SensorPose(0, 0, 14.0, 0), clock, albedo=0.0)(True) == pytest.approx(10.5)
-
-
-def test_without_the_led_contrast_is_halved_and_height_does_not_matter(clock):
-    for height_mm in (5.0, 14.0, 60.0):
-        assert sight(SensorPose(0, 0, height_mm, 0), clock)(False) == pytest.approx(30.25)
+@pytest.mark.parametrize(
+    ("height_mm", "albedo", "lit", "shown"),
+    [(14.0, 1.0, True, 60.5), (14.0, 0.0, True, 10.5), *((h, 1.0, False, 30.25) for h in (5.0, 14.0, 60.0))],
+)
+def test_what_the_brick_shows_with_the_led_and_with_the_rooms_half_alone(clock, height_mm, albedo, lit, shown):
+    assert sight(SensorPose(0, 0, height_mm, 0), clock, albedo=albedo)(lit) == pytest.approx(shown)
 
 
 def test_the_led_s_light_peaks_at_some_millimetres_and_is_gone_at_some_centimetres(clock):

@@ -316,6 +316,7 @@ def test_where_it_knows_that_it_read_is_written_in_the_plans_frame():
     own = Own(lambda pose: {"value": 1.0, "x_mm": pose.x_mm + 0.5, "orientation_rad": 0.1})
     readings = taken(own, [], plan())
     assert [reading.pose for reading in readings][:2] == [Pose(-9.5, 0.0, 0.1), Pose(0.5, 0.0, 0.1)]
+    assert taken(Own(), [], plan(x_mm=[1 / 3] * 4))[0].pose.x_mm == 1 / 3  # as planned, not to a micron
 
 
 @pytest.mark.parametrize(

@@ -123,7 +123,8 @@ class FileObject:
 
     def __init__(self, path: Path, where: str, content: object, *, largest: float = LARGEST) -> None:
         if not isinstance(content, dict):
-            raise FileError(path, f"{where} is {shortened_json(content)}", "an object {...}, in TOML a table")
+            allowed = f"a table [{where}]" if path.suffix == ".toml" else "an object {...}"
+            raise FileError(path, f"{where or 'the whole'} is {shortened_json(content)}", allowed)
         self.path, self.where, self.largest = path, where, largest
         self.content: dict[str, Any] = content
         self._taken = set[str]()
@@ -145,7 +146,7 @@ class FileObject:
         allowed = f"a finite number of magnitude up to {self.largest:g}"
         return float(self.value(name, allowed, lambda value: is_number_of_file(value, self.largest)))
 
-    def object(self, name: str, allowed: str = "an object {...}, in TOML a table") -> FileObject:
+    def object(self, name: str, allowed: str = "a table of that name") -> FileObject:
         """Return an entry that is an object."""
         content = self.value(name, allowed, lambda value: True)
         return FileObject(self.path, f"{self.where}.{name}".lstrip("."), content, largest=self.largest)

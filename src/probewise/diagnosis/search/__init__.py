@@ -722,22 +722,10 @@ class UnknownEffects:
         return False
 
 
-def search(
-    prepared: Prepared,
-    *,
-    prior: PriorOdds | None = None,
-    max_order: int | None = None,
-    depth: int = 3,
-    after: Searched | None = None,
-    progress: Progress = silent,
-) -> Searched:
-    """Compute evidence and probability of combinations of effects, with and without an unknown effect.
-
-    `prepared`: the readings, the effects, and the null if one is given; `max_order`: largest number of Gaussians of the
-    SSF if no null is given; one more is tried if this is not far behind. Default: three, or one for fewer than 40
-    readings. `after`: an earlier search of the same recording with a given null, with fewer effects: its fits are not
-    made again. Returns `Searched`: evidences and probabilities of all hypotheses, and the refits.
-    """
+def _begin(
+    prepared: Prepared, prior: PriorOdds | None, max_order: int | None, after: Searched | None, progress: Progress
+) -> tuple[SearchState, MisfitTemplates]:
+    """Fit the nulls, or take those of an earlier search; return the state, and the templates of misfits."""
     recording, effects, apparatus = prepared.recording, prepared.effects, prepared.apparatus
     if max_order is None:
         max_order = 1 if len(prepared.usable_rows) < _FEW_READINGS else MAX_ORDER
@@ -772,12 +760,32 @@ def search(
     else:
         state.candidates |= {key: fit for key, fit in after.evidences.fits.items() if not fit.names}
         misfit_templates = replace(after.misfit_templates, about=state.null.found)
-    unknown = _build_unknown_effects(state, misfit_templates)
+    return state, misfit_templates
+
+
+def search(
+    prepared: Prepared,
+    *,
+    prior: PriorOdds | None = None,
+    max_order: int | None = None,
+    depth: int = 3,
+    after: Searched | None = None,
+    progress: Progress = silent,
+) -> Searched:
+    """Compute evidence and probability of combinations of effects, with and without an unknown effect.
+
+    `prepared`: the readings, the effects, and the null if one is given; `max_order`: largest number of Gaussians of the
+    SSF if no null is given; one more is tried if this is not far behind. Default: three, or one for fewer than 40
+    readings. `after`: an earlier search of the same recording with a given null, with fewer effects: its fits are not
+    made again. Returns `Searched`: evidences and probabilities of all hypotheses, and the refits.
+    """
+    state, misfit_templates = _begin(prepared, prior, max_order, after, progress)
+    unknown, noises = _build_unknown_effects(state, misfit_templates), state.refits.noises
 
     def found() -> Searched:
         own = Evidences(state.candidates, state.screened_log_evidences(), unknown.log_z, unknown.shares)
-        posterior = hypothesis_probabilities(own, prior, certain=refits.noises.certain)
-        return Searched(prepared, prior, misfit_templates, refits, own, posterior)
+        posterior = hypothesis_probabilities(own, state.prior, certain=noises.certain)
+        return Searched(prepared, state.prior, misfit_templates, state.refits, own, posterior)
 
     select_forward(state, depth=depth)
     if prepared.null is not None:
@@ -788,15 +796,15 @@ def search(
     _refit_favoured_by_screening(state, lambda: found().posterior)
     if prepared.null is None:
         refit_at_other_orders(state, found().posterior.marginal_over_noise)
-    state.candidates, state.pruned = prune_out_of_vocabulary(state.candidates, refits.noises)
+    state.candidates, state.pruned = prune_out_of_vocabulary(state.candidates, noises)
     progress("comparing unknown effects")
     refitted = [c for c in state.candidates.values() if c.names]
     unknown.weigh_beside(sorted(refitted, key=lambda c: -c.log_z)[:_WITH_UNKNOWN])
     unknown.drop_superfluous(state.candidates.values())
     out = found()
-    if refits.noises.sd_prior is not None:
-        out = out.with_evidences(out.evidences.split_by_sd(on_noise[noise_sd.name]))
-    return out
+    if noises.sd_prior is None:
+        return out
+    return out.with_evidences(out.evidences.split_by_sd(noises.effects[noise_sd.name]))
 
 
 def _refit_favoured_by_screening(state: SearchState, posterior: Callable[[], HypothesisProbabilities]) -> None:

@@ -26,7 +26,7 @@ NEW_START = 5 / PROBLEM.sd  # of each run yet to be recorded, the prior's sd
 
 
 def advised(*names: str) -> Alias:
-    entries = {name: (PREPARED.effects[name], PREPARED.effects[name].bank()[0]) for name in names}
+    entries = {name: (PREPARED.effects[name], PREPARED.effects[name].entries[0]) for name in names}
     pair = Alias(cast(Any, names), 1.0, NOTHING, 0)
     (found,) = pairs_with_separating_scans(
         [pair], PROBLEM, FOUND, entries, np.arange(len(RECORDING.readings)), APPARATUS
@@ -38,7 +38,7 @@ def change(name: str, plan: Any) -> np.ndarray:
     """The change of the readings by the first entry of an effect, in noise sds."""
     effect = PREPARED.effects[name]
     model = Model(FOUND.model.sensor, (effect,), plan)
-    z = np.append(FOUND.z, model.z_of_last_effect(effect.bank()[0][:1])[0])
+    z = np.append(FOUND.z, model.z_of_last_effect(effect.entries[0][:1])[0])
     without = Model(FOUND.model.sensor, (), plan).predict(FOUND.z[None, :])[0]
     return (model.predict(z[None, :])[0] - without) / PROBLEM.sd
 

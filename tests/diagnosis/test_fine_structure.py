@@ -63,7 +63,7 @@ def test_effects_outlast_it():
     for name in ("backlash", "lag", "sensor_tilt", "ambient_gradient", "glint", "battery_sag", "flicker"):
         effect = VOCABULARY[name].for_extent(extent)
         model = found.model.with_effect(effect)
-        z = np.concatenate([found.z, model.z_of_last_effect(effect.bank()[0][:1])[0]])
+        z = np.concatenate([found.z, model.z_of_last_effect(effect.entries[0][:1])[0]])
         change = (model.predict(z[None, :])[0] - found.model.predict(found.z[None, :])[0])[:, None]
         kept = np.linalg.norm(beside.project(change)) / np.linalg.norm(without.project(change))
         assert kept > 0.9, name

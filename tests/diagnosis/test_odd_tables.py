@@ -98,7 +98,7 @@ def test_a_simulator_that_copes_with_a_missing_input_has_effects_of_that_column(
     simulator = Simulator("y", "V", {"a": (-5, 5)}, simulate=lambda p, u: p["a"] + 2.0 * np.nan_to_num(u["x"]))
     prepared = prepare_system(simulator, table_for(simulator, {"x": x, "y": 1.0 + 2.0 * np.nan_to_num(x) + _Y - 1}))
     assert {"periodic_error:x", "input_gain:x", "sensitivity:x"} <= set(prepared.effects)
-    assert np.isfinite(prepared.effects["periodic_error:x"].bank()).all()
+    assert np.isfinite(prepared.effects["periodic_error:x"].entries).all()
 
 
 @pytest.mark.parametrize(("gap", "n_variants"), [(100.0, 2), (0.0, 1)])

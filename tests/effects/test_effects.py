@@ -58,7 +58,7 @@ def test_every_effect_keeps_the_contract(name):
     assert len(effect.units) == len(names)
     assert effect.covariates
     for variant in (effect.variants()[0], effect.variants()[-1]):
-        bank = variant.bank()
+        bank = variant.entries
         assert bank.ndim == 3
         assert bank.shape[2] == len(names)
         assert variant.prior.names == names
@@ -81,7 +81,7 @@ def test_every_setting_of_every_bank_changes_finite_readings(name):
     plain = base().predict(np.zeros((1, 0)), PLAN)
     changed = 0.0
     for variant in effect.variants()[:: max(len(effect.variants()) // 6, 1)]:
-        settings = variant.bank().reshape(-1, len(variant.prior.names))[:40]
+        settings = variant.entries.reshape(-1, len(variant.prior.names))[:40]
         chain = base().with_effects(variant)
         readings = chain.predict(settings, PLAN)
         assert readings.shape == (len(settings), len(PLAN))
@@ -100,10 +100,10 @@ def test_every_effect_acts_alike_in_another_process(name):
     values = np.full((1, len(PLAN)), 0.4)
     for variant in {effect, effect.variants()[0], effect.variants()[-1]}:
         copy = pickle.loads(pickle.dumps(variant))
-        theta = variant.bank()[0, :1]
+        theta = variant.entries[0, :1]
         assert copy.sentence(theta[0], theta[0]) == variant.sentence(theta[0], theta[0])
         assert (copy.name, copy.scans, copy.patterns) == (variant.name, variant.scans, variant.patterns)
-        np.testing.assert_array_equal(copy.bank(), variant.bank())
+        np.testing.assert_array_equal(copy.entries, variant.entries)
         if effect.stage in (Stage.RESPONSE, Stage.GAIN, Stage.OFFSET, Stage.LAG, Stage.SATURATION):
             np.testing.assert_array_equal(copy.apply(values, theta, PLAN), variant.apply(values, theta, PLAN))
     assert pickle.loads(pickle.dumps(EFFECTS[name])) is EFFECTS[name]
@@ -317,10 +317,10 @@ def test_an_effect_means_the_same_on_a_recording_far_from_0(name):
     assert near.where.origin == Origin()
     expected = (FAR.time_s + first_s, FAR.x_mm + x_mm, FAR.y_mm + y_mm)
     assert dataclasses.astuple(far.where.origin) == pytest.approx(expected)
-    np.testing.assert_allclose(far.bank(), near.bank(), rtol=1e-6)
+    np.testing.assert_allclose(far.entries, near.entries, rtol=1e-6)
     u = np.random.default_rng(0).random((50, len(near.prior.names)))
     np.testing.assert_allclose(far.prior.from_unit_cube(u), near.prior.from_unit_cube(u), rtol=1e-6)
-    entries = near.bank().reshape(-1, len(near.prior.names))[:40]
+    entries = near.entries.reshape(-1, len(near.prior.names))[:40]
     found = over(there).with_effects(far).predict(entries, there)
     np.testing.assert_allclose(found, over(at_0).with_effects(near).predict(entries, at_0), atol=1e-4)
     said, plainly = (sentence_from_samples(effect, entries[:1]) for effect in (far, near))
@@ -394,7 +394,7 @@ def test_gates_open_what_each_variant_acts_on(name):
     everywhere = base().with_effects(effect).predict(always, PLAN) - plain
     for k in (0, 7, len(opened) - 1):
         variant = effect.variants()[k]
-        own = base().with_effects(variant).predict(variant.bank()[0], PLAN) - plain
+        own = base().with_effects(variant).predict(variant.entries[0], PLAN) - plain
         np.testing.assert_allclose(everywhere * opened[k], own, atol=1e-12)
 
 
@@ -433,7 +433,7 @@ def test_places_that_differ_in_the_last_digit_are_one_place():
         assert prior.from_unit_cube(np.array([[0.5, 0.0, 0.5]]))[0, 1] == pytest.approx(0.3)
     alone = Extent(0.0, 1.0, plan_along(out, np.zeros(1001)))
     there, here = (EFFECTS["missing_tooth"].for_extent(extent).variants() for extent in (both, alone))
-    np.testing.assert_allclose([v.bank()[0, 0] for v in there], [v.bank()[0, 0] for v in here], atol=1e-12)
+    np.testing.assert_allclose([v.entries[0, 0] for v in there], [v.entries[0, 0] for v in here], atol=1e-12)
 
 
 def test_the_time_of_a_step_is_spread_over_the_readings_between_which_it_may_lie():
@@ -451,7 +451,7 @@ def test_the_time_of_a_step_is_spread_over_the_readings_between_which_it_may_lie
 @pytest.mark.parametrize("name", ["flicker", "periodic_position_error"])
 def test_sine_and_cosine_join_into_amplitude_and_phase(name):
     effect = VOCABULARY[name].for_extent(EXTENT)
-    entry = effect.bank()[3]
+    entry = effect.entries[3]
     start = effect.start(entry, np.array([1.2, -0.5]))
     rate = entry[0, 1]
     x = np.linspace(0, 7, 50)
@@ -463,7 +463,7 @@ def test_sine_and_cosine_join_into_amplitude_and_phase(name):
 def test_frequencies_lie_close_enough_to_find_any():
     """Half the spacing lets a wave of the whole recording slip by a quarter of a turn at either end, at most."""
     flicker = VOCABULARY["flicker"].for_extent(Extent(10.0, 60.0, paper_plan()))
-    frequencies = flicker.bank()[:, 0, 1]
+    frequencies = flicker.entries[:, 0, 1]
     assert flicker.prior.from_unit_cube(np.array([[0.5, 1.0, 0.5]]))[0, 1] == pytest.approx(0.5 / 1.2)
     assert np.diff(frequencies).max() * np.ptp(paper_plan().time_s) <= 0.51
 
@@ -474,7 +474,7 @@ def test_a_missing_voltage_of_the_battery_is_that_of_the_readings_around_it():
     with_gaps = np.array([np.nan, 7500.0, np.nan, 7400.0, np.nan, np.nan, 7100.0, np.nan])
     plan = replace(plan, covariates={"battery_mv": with_gaps})
     effect = VOCABULARY["battery_sag"].for_extent(Extent(0.0, 1.0, plan))
-    assert effect.bank()[0, 0, 0] == pytest.approx(0.02 / 0.4)
+    assert effect.entries[0, 0, 0] == pytest.approx(0.02 / 0.4)
     below = np.array([0.5, 0.5, 0.55, 0.6, 0.7, 0.8, 0.9, 0.9])
     out = effect.apply(np.full((1, 8), 40.0), np.array([[0.1]]), plan)
     np.testing.assert_allclose(out[0], 40 * (1 - 0.1 * below))

@@ -96,8 +96,8 @@ def test_a_lattice_shows_through_printing(digits):
 @pytest.mark.parametrize("unit", [1e-12, 1.0, 1e9])
 def test_the_bank_of_lost_readings_lies_within_their_prior_in_any_unit(unit):
     lost = dropouts.for_extent(Extent(10.0 * unit, 60.0 * unit, PLAN))
-    values = lost.bank()[:, 0, 1]
-    assert np.isfinite(lost.prior.log_prob(lost.bank()[:, 0])).all()
+    values = lost.entries[:, 0, 1]
+    assert np.isfinite(lost.prior.log_prob(lost.entries[:, 0])).all()
     np.testing.assert_allclose(np.unique(values), [9.50510 * unit, 60.49490 * unit])
 
 

@@ -117,7 +117,7 @@ def test_a_slope_among_the_rivals_is_one_hundredth_of_the_calibrated_height(clos
     for sensor, height_mm in ((plain, LOW_MM), (replace(plain, instrumentation=Instrumentation()), 14.0)):
         experiment = experiment_for(sensor, CIRCLE, FIELD, trust=0.9)
         (slope,) = [kind.effect for kind in experiment.kinds if kind.left_out == "height_gradient"]
-        assert slope.bank()[0, 0, 0] == pytest.approx(0.01 * height_mm / np.hypot(300.0, 200.0))
+        assert slope.entries[0, 0, 0] == pytest.approx(0.01 * height_mm / np.hypot(300.0, 200.0))
 
 
 def test_a_journal_names_the_height_only_beside_others_to_choose(small, close_sensor):

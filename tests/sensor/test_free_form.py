@@ -71,7 +71,7 @@ def test_hypotheses_that_share_a_geometry_are_seen_as_each_alone(name, monkeypat
     built = Chain(FreeMixture(N_FREE_FORM), FreeLevels(), KnownScene(PLAN.patterns), effects)
     shapes = free_form_theta(np.repeat(ONE, 12, axis=0), 0.1 * RNG.standard_normal((12, N_BENDS)))
     shapes[6:, 1::6] += 0.3
-    own = np.concatenate([effect.bank()[0][:1] for effect in effects], axis=1) if effects else np.zeros((1, 0))
+    own = np.concatenate([effect.entries[0][:1] for effect in effects], axis=1) if effects else np.zeros((1, 0))
     own = np.where(np.arange(12)[:, None] % 6 < 3, 1.0, 1.2) * own
     theta = np.concatenate([shapes, np.tile([10.0, 60.0], (12, 1)), own], axis=1)
     together = built.predict(theta, PLAN)

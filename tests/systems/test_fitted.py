@@ -76,7 +76,7 @@ def test_every_form_that_is_bound_again_does_what_it_did():
     assert again.keys() == forms.keys()
     rng = np.random.default_rng(3)
     for name, form in forms.items():
-        own = form.bank()[len(form.bank()) // 2][:1] * (1 + 0.1 * rng.random())
+        own = form.entries[len(form.entries) // 2][:1] * (1 + 0.1 * rng.random())
         theta = np.concatenate([ABOUT.theta, own], axis=1)
         first, second = (ABOUT.system.chain(TABLE, [f]).predict(theta, TABLE) for f in (form, again[name]))
         np.testing.assert_array_equal(first, second, err_msg=name)

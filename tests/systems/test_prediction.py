@@ -212,7 +212,7 @@ def test_an_effect_with_a_memory_goes_on_after_a_row_that_lacks_an_input(effect)
     form = bind_forms(about)[effect]
     model = fitted()
     names = (*model.names, *(f"{effect}.{name}" for name in form.prior.names))
-    setting = np.tile(form.bank()[0, 0], (500, 1))
+    setting = np.tile(form.entries[0, 0], (500, 1))
     model = dataclasses.replace(
         model,
         names=names,

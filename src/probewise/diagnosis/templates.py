@@ -332,7 +332,7 @@ class TemplateCache:
         if first is None or len(first.variants) > 1 or len(effect.variants()) > 1:
             return None
         numbers = {setting.tobytes(): k for k, setting in enumerate(first.settings)}
-        at = [numbers.get(setting.tobytes()) for setting in effect.variants()[0].bank()]
+        at = [numbers.get(setting.tobytes()) for setting in effect.variants()[0].entries]
         if None in at:
             return None
         columns, settings = (tuple(every[k] for k in cast(list[int], at)) for every in (first.columns, first.settings))
@@ -345,7 +345,7 @@ def templates_of_effect(found: Fit, effect: Effect, usable: IntArray, *, most: i
     Variants are its discrete choices, such as of scans. With `most`, so many entries are predicted, evenly spread.
     """
     variants = effect.variants()
-    banks = [variant.bank() for variant in variants]
+    banks = [variant.entries for variant in variants]
     choice = np.repeat(np.arange(len(variants)), [len(bank) for bank in banks])
     entries = [entry for bank in banks for entry in bank]
     if most is not None and most < len(entries):

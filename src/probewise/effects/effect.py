@@ -212,10 +212,6 @@ class Effect:
         """Prior of each parameter, by name; none where all have one together."""
         return self.parameters if isinstance(self.parameters, Mapping) else {}
 
-    def bank(self) -> FloatArray:
-        """Return the template bank, (n_entries, n_columns, n_params)."""
-        return self.entries
-
     @property
     def n_peaks(self) -> int:
         """Number of equivalent posterior modes within the prior; a fit finds one of them."""
@@ -339,16 +335,11 @@ _ROW_BY_ROW = (Stage.OFFSET, Stage.GAIN, Stage.POSE)
 class WaveEffect(Effect):
     """A wave: its entries are a sine and a cosine each, its amplitude is the first parameter, its phase the last.
 
-    The readings suggest further frequencies, `suggested` (n_suggested,): refits may start there. A test of the readings
+    The last `n_suggested` are of frequencies that the readings suggest: refits may start there. A test of the readings
     leaves them out, for other readings would have suggested others.
     """
 
-    suggested: FloatArray = field(default_factory=lambda: np.zeros(0))
-
-    def bank(self) -> FloatArray:
-        if not self.suggested.size:
-            return self.entries
-        return np.concatenate([self.entries, sine_and_cosine_entries(self.entries[0, 0, 0], self.suggested)])
+    n_suggested: int = 0
 
     def start(self, entry: FloatArray, amounts: FloatArray) -> FloatArray:
         """Return the wave that is the sum of an entry's sine and cosine, in their fitted amounts, (n_params,)."""
@@ -358,11 +349,11 @@ class WaveEffect(Effect):
         return np.asarray(setting)
 
     def with_fewer_variants(self) -> Self:
-        return self._without_suggested if self.suggested.size else self
+        return self._without_suggested if self.n_suggested else self
 
     @cached_property
     def _without_suggested(self) -> Self:  # one object at each call, as `variants` returns
-        return replace(self, suggested=np.zeros(0))
+        return replace(self, entries=self.entries[: -self.n_suggested], n_suggested=0)
 
 
 @dataclass(frozen=True, eq=False)

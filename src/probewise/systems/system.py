@@ -261,7 +261,7 @@ class System:
         """Return whether the simulator, or it with an effect, predicts some rows as `part` of a table as in it."""
         trial, theta = replace(self, caller=replace(cast(Caller, self.caller))), self.theta(self.starts)
         if effect is not None:
-            settings = effect.bank().reshape(-1, effect.bank().shape[-1])
+            settings = effect.entries.reshape(-1, effect.entries.shape[-1])
             settings = settings[:: max(len(settings) // _N_SETTINGS, 1)]
             theta = np.concatenate([np.resize(theta, (len(settings), theta.shape[1])), settings], axis=1)
         chain = trial.chain(table, () if effect is None else (effect,))

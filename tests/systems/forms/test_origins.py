@@ -72,12 +72,12 @@ def test_every_form_of_a_recording_by_the_epoch_is_that_of_the_same_recording_fr
     expected, found = bind_forms(near), bind_forms(later)
     assert found.keys() == expected.keys()
     for name, form in expected.items():
-        setting = form.bank()[len(form.bank()) // 3, 0]
+        setting = form.entries[len(form.entries) // 3, 0]
         if name.startswith(("offset_step", "gain_step", "steps")):  # in time as printed
             assert found[name].change_points.at == tuple(at + EPOCH for at in form.change_points.at)
             continue
         clock = name == "clock_drift"  # its trial changes of times are a hundred times the precision of such times
-        np.testing.assert_allclose(found[name].bank(), form.bank(), rtol=1e-2 if clock else 1e-6, err_msg=name)
+        np.testing.assert_allclose(found[name].entries, form.entries, rtol=1e-2 if clock else 1e-6, err_msg=name)
         readings = _readings(later, found[name], setting)
         np.testing.assert_allclose(readings, _readings(near, form, setting), atol=1e-5, err_msg=name)
 
@@ -87,7 +87,7 @@ def test_every_formula_of_a_recording_by_the_epoch_is_that_of_the_same_recording
     expected, found = (list(formula_forms(about)) for about in (near, later))
     assert len(found) == len(expected)
     for one, other in zip(expected, found, strict=True):
-        setting = one.bank()[len(one.bank()) // 3, 0]
+        setting = one.entries[len(one.entries) // 3, 0]
         readings = _readings(later, other, setting)
         np.testing.assert_allclose(readings, _readings(near, one, setting), atol=0.1 * 0.01, err_msg=one.name)
 
@@ -107,7 +107,7 @@ def test_a_periodic_error_of_a_column_far_from_0_has_its_phase_from_there():
 def test_what_counts_from_a_far_time_says_so_and_nothing_else_does(how, name):
     """The drift of a gain is 0 at the first time: without that time its size alone says nothing."""
     near, later = (bind_forms(_about(shift, 0.0, how)) for shift in (0.0, EPOCH))
-    setting = near[name].bank()[:1, 0]
+    setting = near[name].entries[:1, 0]
     plain = sentence_from_samples(near[name], setting)
     assert sentence_from_samples(later[name], setting) == f"{plain} (t_s counts from 1700000000 s)"
     assert not [each for each, form in near.items() if form.counted_from]

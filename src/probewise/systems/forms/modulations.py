@@ -337,8 +337,10 @@ def wave_form(about: ReferenceFit, name: str, of: Quantity) -> Iterator[Effect]:
         size, period = value_with_sd(mean[0], sd[0], of.unit), period_with_sd(mean[1], sd[1], about.time_unit)
         return f"{of.what} oscillates with an amplitude of {size} and a period of {period}"
 
-    own = declared_wave(about, frequencies, of.unit, highest)
-    return of.varying(about, name, at_rows, says=says, suggested=suggested, **own)
+    for form in of.varying(about, name, at_rows, says=says, **declared_wave(about, frequencies, of.unit, highest)):
+        more = sine_and_cosine_entries(form.entries[0, 0, 0], suggested)
+        entries = np.concatenate([form.entries, more])
+        yield replace(cast(WaveEffect, form), entries=entries, n_suggested=len(suggested))
 
 
 _KINDS = {"drift": "drifts", "step": "steps", "per_run": "differs"}

@@ -7,7 +7,7 @@ import pytest
 
 from probewise.arm import Pose, Reading
 from probewise.experiment.kinds import prior_posterior
-from probewise.experiment.rivals import PACED_S_PER_READING, EffectInPacedTime, Pace, gain_loss, rivals_of
+from probewise.experiment.rivals import PACED_S_PER_READING, Pace, gain_loss, rivals_of
 from probewise.proof.study import REFERENCE, experiment_of
 
 
@@ -26,7 +26,6 @@ def test_a_fast_instrument_drifts_over_as_many_readings_as_a_slow_one(name):
     experiment = replace(experiment_of(REFERENCE), trust=0.9)
     slow, fast = (experiment.problem(readings(*clock)).recording.plan for clock in ((8.0,), (0.02, 1.7e9)))
     for effect in rivals(name):
-        assert isinstance(effect, EffectInPacedTime)
         theta = effect.prior.from_unit_cube(np.random.default_rng(1).random((20, len(effect.prior.names))))
         value = np.tile(np.linspace(10.0, 60.0, 8), (20, 1))
         np.testing.assert_allclose(effect.apply(value, theta, fast), effect.apply(value, theta, slow), rtol=1e-4)

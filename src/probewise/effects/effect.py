@@ -629,10 +629,6 @@ class WrappedEffect(stages.Effect[V]):
         return self.effect.stage
 
     @property
-    def form(self) -> str:
-        return str(getattr(self.effect, "form", ""))
-
-    @property
     def prior(self) -> Prior:
         return self.effect.prior
 

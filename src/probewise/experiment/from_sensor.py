@@ -14,11 +14,11 @@ from probewise._kinds import require_kind, require_like, require_one_of
 from probewise.arm import ReadingScale
 from probewise.calibration import FittedSensor
 from probewise.calibration.sensor_file import require_fitted_sensor
-from probewise.effects import Known
+from probewise.effects import Effect, Known
 from probewise.errors import ParameterError, require
 from probewise.experiment.method import NestedSampling
 from probewise.experiment.paper import least_sd, student_t_likelihood
-from probewise.experiment.rivals import OF_MOTION, DescribedEffect, FromRest
+from probewise.experiment.rivals import OF_MOTION, from_rest
 from probewise.experiment.setup import Experiment
 from probewise.experiment.simulated import ModelName, scale_of
 from probewise.inference import Naive, Rounded
@@ -239,7 +239,7 @@ def _effects_of_sensor(sensor: FittedSensor, *, estimated: bool) -> tuple[AnyEff
         values = tuple(means[name] for name in names)
         samples = [sensor.samples[:, sensor.names.index(name)] for name in names]
         if estimated and all(own.std() > 0 for own in samples):
-            acting = FromRest(cast(DescribedEffect, effect)) if effect.name in OF_MOTION else effect
+            acting = from_rest(cast(Effect, effect)) if effect.name in OF_MOTION else effect
             effects.append(Known(acting, values, tuple(map(_marginal_fitted_to, samples))))
         else:
             effects.append(Known(effect, values))

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray, logsumexp, read_only_floats
-from probewise.effects import Known
-from probewise.experiment.rivals import DescribedEffect, SensorModelRival, powers_of_s
+from probewise.effects import Effect, Known
+from probewise.experiment.rivals import SensorModelRival, powers_of_s
 from probewise.inference.problem import Likelihood, SensorProblem, checked_log_prob
 from probewise.inquiry import TabulatedChain
 from probewise.inquiry.smc import Particles, prior_particles
@@ -97,7 +97,7 @@ class HypothesisKind:
     prior: Prior
     model: SensorModel
     likelihood: Likelihood
-    effect: DescribedEffect | None = None
+    effect: Effect | None = None
 
     @property
     def shape(self) -> str:
@@ -172,7 +172,7 @@ def _kind(
     prior: Prior,
     model: SensorModel,
     likelihood: Likelihood,
-    effect: DescribedEffect | None = None,
+    effect: Effect | None = None,
 ) -> HypothesisKind:
     """Build a kind of a shape, with its `share` of the shape's probability and a model of all parameters."""
     log_prior = math.log(member.share) + math.log(share)

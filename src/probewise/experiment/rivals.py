@@ -12,7 +12,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, Self, cast
+from functools import partial
+from typing import Any, Self, cast
 
 import numpy as np
 
@@ -30,7 +31,7 @@ from probewise.effects import (
     pose,
     reading,
 )
-from probewise.effects.effect import AMPLITUDE, WrappedEffect
+from probewise.effects.effect import AMPLITUDE
 from probewise.effects.optics import PatchPrior
 from probewise.errors import ParameterError
 from probewise.experiment.noise_rivals import DeclaredNoise, noise_likelihoods
@@ -64,7 +65,7 @@ class SensorModelRival:
     """One alternative to the sensor model: an `effect` on the noise-free reading, or another `likelihood`; not both."""
 
     name: str
-    effect: DescribedEffect | None = None
+    effect: Effect | None = None
     likelihood: Likelihood | None = None
 
 
@@ -99,12 +100,12 @@ def rivals_of(
     return tuple(rivals)
 
 
-def _ways_in_run(effect: Effect, field_mm: tuple[float, float]) -> list[DescribedEffect]:
+def _ways_in_run(effect: Effect, field_mm: tuple[float, float]) -> list[Effect]:
     """Return the ways in which an effect may act in a run, with a run's prior; effects of time act in paced time."""
     in_run = replace(effect, parameters=_prior_for_run(effect, field_mm))
     if effect.name in OF_MOTION:
-        return [in_run, FromRest(in_run)]
-    return [EffectInPacedTime(in_run) if effect.name in _IN_TIME else in_run]
+        return [in_run, from_rest(in_run)]
+    return [in_paced_time(in_run) if effect.name in _IN_TIME else in_run]
 
 
 def _plan_there_and_back(length_mm: float, height_mm: float | None) -> Plan:
@@ -221,22 +222,6 @@ _OF_WHOLE_FIELD = (  # their scale is the field's
 )
 
 
-class DescribedEffect(AnyEffect, Protocol):
-    """An effect that can describe itself in a sentence."""
-
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Describe the effect, given posterior means and sds of its parameters."""
-        ...
-
-
-class _WrappedDescribedEffect(WrappedEffect[Any]):
-    effect: DescribedEffect
-
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Describe the effect, given posterior means and sds of its parameters."""
-        return self.effect.sentence(mean, sd)
-
-
 def _prior_for_run(effect: Effect, field_mm: tuple[float, float]) -> Mapping[str, Marginal]:
     """Return an effect's priors for a single run: sizes large enough to matter, and times within the run.
 
@@ -257,27 +242,21 @@ def _prior_for_run(effect: Effect, field_mm: tuple[float, float]) -> Mapping[str
     return marginals
 
 
-@dataclass(frozen=True, eq=False)
-class EffectInPacedTime(_WrappedDescribedEffect):
-    """An effect whose times and rates are in paced time; in recorded time if the plan has no paced time."""
+def in_paced_time(effect: Effect) -> Effect:
+    """Return an effect whose times and rates are in paced time; in recorded time if the plan has no paced time."""
 
-    effect: DescribedEffect
-
-    def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Apply the effect in paced time, or in recorded time if the plan has no paced time."""
+    def act(value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
         time_s = paced_time_s(plan)
-        return np.asarray(self.effect.apply(value, theta, plan if time_s is None else replace(plan, time_s=time_s)))
+        return np.asarray(effect.apply(value, theta, plan if time_s is None else replace(plan, time_s=time_s)))
+
+    return replace(effect, apply=act, source=partial(in_paced_time, effect))
 
 
-@dataclass(frozen=True, eq=False)
-class FromRest(_WrappedDescribedEffect):
-    """An effect of the direction of motion that spares a run's first reading, before which the arm may have rested."""
+def from_rest(effect: Effect) -> Effect:
+    """Return an effect of the direction of motion that spares a run's first reading: the arm may have rested before."""
 
-    effect: DescribedEffect
-
-    def apply(self, value: Any, theta: FloatArray, plan: Plan) -> Any:
-        """Apply the effect to all readings but the run's first."""
-        moved = self.effect.apply(value, theta, plan)
+    def act(value: Any, theta: FloatArray, plan: Plan) -> Any:
+        moved = effect.apply(value, theta, plan)
         time_s = paced_time_s(plan)
         if time_s is None or not (first := time_s <= 0.0).any():
             return moved
@@ -285,6 +264,8 @@ class FromRest(_WrappedDescribedEffect):
             return np.where(first, value, moved)
         x_mm, y_mm = np.where(first, value.x_mm, moved.x_mm), np.where(first, value.y_mm, moved.y_mm)
         return replace(moved, x_mm=x_mm, y_mm=y_mm)
+
+    return replace(effect, apply=act, source=partial(from_rest, effect))
 
 
 @dataclass(frozen=True)
@@ -312,13 +293,13 @@ class Pace:
         return replace(plan, covariates={**plan.covariates, _PACED: paced_s})
 
     def in_seconds(self, effect: AnyEffect, theta: FloatArray) -> FloatArray:
-        """Return an effect's parameters, (..., n_params), in seconds, those of an `EffectInPacedTime` converted."""
+        """Return an effect's parameters, (..., n_params), in seconds: those in paced time are converted."""
         return np.asarray(theta * (self.s_per_reading / PACED_S_PER_READING) ** powers_of_s(effect))
 
 
 def powers_of_s(effect: AnyEffect | None) -> FloatArray:
-    """Return the power of paced seconds in each parameter's unit, (n_params,); 0 but for an `EffectInPacedTime`."""
-    if not isinstance(effect, EffectInPacedTime):
+    """Return the power of paced seconds in each parameter's unit, (n_params,); 0 but for effects of time."""
+    if effect is None or effect.name not in _IN_TIME:
         return np.zeros(0 if effect is None else len(effect.prior.names))
     return np.array([float(_POWERS_OF_S.get(name, 0)) for name in effect.prior.names])
 

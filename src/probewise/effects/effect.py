@@ -615,41 +615,8 @@ def sine_and_cosine_entries(*parameters: ArrayLike) -> FloatArray:
 V = TypeVar("V")
 
 
-class WrappedEffect(stages.Effect[V]):
-    """An effect that has everything from `effect`, except what a subclass overrides."""
-
-    effect: stages.Effect[V]
-
-    @property
-    def name(self) -> str:
-        return self.effect.name
-
-    @property
-    def stage(self) -> Stage:
-        return self.effect.stage
-
-    @property
-    def prior(self) -> Prior:
-        return self.effect.prior
-
-    def apply(self, value: V, theta: FloatArray, plan: Plan) -> V:
-        return self.effect.apply(value, theta, plan)
-
-
 @dataclass(frozen=True)
-class Informed(WrappedEffect[V]):
-    """An effect with the prior `own`, from earlier knowledge of its parameters, in place of the usual prior."""
-
-    effect: stages.Effect[V]
-    own: Prior
-
-    @property
-    def prior(self) -> Prior:
-        return self.own
-
-
-@dataclass(frozen=True)
-class Known(WrappedEffect[V]):
+class Known(stages.Effect[V]):
     """An effect with fixed parameters, none of them free; `values` are in the order of `effect.prior.names`.
 
     Where they are estimates, `marginals` are their distributions, in the same order: a run that trusts its sensor uses
@@ -666,6 +633,14 @@ class Known(WrappedEffect[V]):
         require(len(self.marginals) in (0, len(names)), "marginals", self.marginals, f"a prior for each of {names}")
 
     @property
+    def name(self) -> str:
+        return self.effect.name
+
+    @property
+    def stage(self) -> Stage:
+        return self.effect.stage
+
+    @property
     def prior(self) -> Product:
         return Product({})
 
@@ -674,6 +649,7 @@ class Known(WrappedEffect[V]):
         return self.effect.apply(value, np.array([self.values]), plan)
 
     @property
-    def informed(self) -> Informed[V]:
+    def informed(self) -> Effect:
         """The effect with free parameters again, and `marginals` as its prior."""
-        return Informed(self.effect, Product(dict(zip(self.effect.prior.names, self.marginals, strict=True))))
+        own = cast(Effect, self.effect)
+        return replace(own, parameters=dict(zip(own.prior.names, self.marginals, strict=True)))

@@ -1,4 +1,4 @@
-"""Sampling coordinates: moments instead of A, B and C, Gaussians sorted by mass; or the whole's, or without labels."""
+"""Sampling coordinates: moments instead of A, B and C, Gaussians sorted by mass; or without labels."""
 
 import math
 
@@ -7,7 +7,6 @@ import pytest
 
 from probewise.calibration import SSFPrior
 from probewise.calibration.peaks import LightContrasts
-from probewise.calibration.quick import WholeFootprintCoordinates
 from probewise.priors import LogUniform, Uniform
 
 
@@ -25,18 +24,10 @@ def prior(n_gaussians, *, by_mass):
 CASES = pytest.mark.parametrize(("n_gaussians", "by_mass"), [(1, False), (1, True), (2, False), (3, True)])
 
 
-def coordinates(belief, *, whole):
-    return WholeFootprintCoordinates(belief, (1.0, 0.5), 20.0) if whole else belief.coordinates
-
-
-WHOLE = pytest.mark.parametrize("whole", [False, True])
-
-
 @CASES
-@WHOLE
-def test_coordinates_lead_back_to_the_gaussians_sorted_by_mass(n_gaussians, by_mass, whole):
+def test_coordinates_lead_back_to_the_gaussians_sorted_by_mass(n_gaussians, by_mass):
     belief = prior(n_gaussians, by_mass=by_mass)
-    space = coordinates(belief, whole=whole)
+    space = belief.coordinates
     theta = belief.from_unit_cube(np.random.default_rng(2).random((50, len(belief.names))))
     x = space.enter(theta)
     back, log_density = space.leave(x)
@@ -51,11 +42,10 @@ def test_coordinates_lead_back_to_the_gaussians_sorted_by_mass(n_gaussians, by_m
 
 
 @CASES
-@WHOLE
-def test_the_density_is_the_priors_times_the_volume_that_coordinates_stretch(n_gaussians, by_mass, whole):
+def test_the_density_is_the_priors_times_the_volume_that_coordinates_stretch(n_gaussians, by_mass):
     """The Jacobian by central differences; N! for the labellings that became one."""
     belief = prior(n_gaussians, by_mass=by_mass)
-    space = coordinates(belief, whole=whole)
+    space = belief.coordinates
     for row in space.enter(belief.from_unit_cube(np.random.default_rng(3).random((5, len(belief.names))))):
         step = 1e-6 * np.maximum(1.0, np.abs(row))
         ahead, behind = (space.leave(row + sign * np.diag(step))[0] for sign in (1, -1))
@@ -65,10 +55,9 @@ def test_the_density_is_the_priors_times_the_volume_that_coordinates_stretch(n_g
         assert log_density[0] == pytest.approx(expected, abs=1e-6)
 
 
-@WHOLE
-def test_what_is_not_sorted_by_mass_is_outside_the_prior(whole):
+def test_what_is_not_sorted_by_mass_is_outside_the_prior():
     belief = prior(3, by_mass=True)
-    space = coordinates(belief, whole=whole)
+    space = belief.coordinates
     x = space.enter(belief.from_unit_cube(np.random.default_rng(7).random((20, 20))))
     heavier, swapped = x.copy(), x.copy()
     heavier[:, 6] = 0.1

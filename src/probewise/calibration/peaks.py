@@ -228,13 +228,14 @@ class LightContrasts:
 
 
 @dataclass(frozen=True, eq=False)
-class _StudentTDensity:
+class StudentTDensity:
     """A multivariate Student-t of 8 degrees of freedom: mean, (d,), and Cholesky root of its scale matrix, (d, d)."""
 
     mean: FloatArray
     root: FloatArray
 
     def draw(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw points, (n, d)."""
         return np.asarray(self.mean + student_t_draws(n, len(self.mean), _DEGREES_OF_FREEDOM, rng=rng) @ self.root.T)
 
     def square_distance(self, y: FloatArray) -> FloatArray:
@@ -248,7 +249,7 @@ class _StudentTDensity:
         norm = student_t_log_norm(d, nu) - float(np.log(np.diag(self.root)).sum())
         return np.asarray(norm - 0.5 * (nu + d) * np.log1p(self.square_distance(y) / nu))
 
-    def refitted(self, y: FloatArray, log_weight: FloatArray) -> _StudentTDensity:
+    def refitted(self, y: FloatArray, log_weight: FloatArray) -> StudentTDensity:
         """Fit to weighted draws; the fewer are effective, the more of the present covariance is kept."""
         least = _LEAST_PER_COORDINATE * y.shape[1]
         log_weight = tempering_power(log_weight, least) * log_weight
@@ -257,7 +258,7 @@ class _StudentTDensity:
         off = y - mean
         kept = min(1.0, y.shape[1] / n_effective(log_weight))
         covariance = (1.0 - kept) * (off * weight[:, None]).T @ off + kept * self.root @ self.root.T
-        return _StudentTDensity(mean, np.asarray(np.linalg.cholesky(_WIDENED**2 * covariance)))
+        return StudentTDensity(mean, np.asarray(np.linalg.cholesky(_WIDENED**2 * covariance)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,7 +266,7 @@ class _MixtureAboutPeaks:
     """Densities about peaks, each averaged over the labels, in the coordinates `space`, with shares that sum to 1."""
 
     space: LightContrasts
-    densities: list[_StudentTDensity]
+    densities: list[StudentTDensity]
     share: FloatArray
 
     def log_density(self, y: FloatArray) -> FloatArray:
@@ -289,12 +290,12 @@ def distinct_peaks(problem: SensorProblem, peaks: FloatArray) -> FloatArray:
     assert isinstance(problem.prior, SSFPrior)
     space = LightContrasts(problem.prior)
     kept: list[FloatArray] = []
-    densities: list[_StudentTDensity] = []
+    densities: list[StudentTDensity] = []
     for peak in peaks:
         labelled = space.relabelled(space.enter(peak[None]))
         distance = min((density.square_distance(labelled).min() for density in densities), default=math.inf)
         if len(kept) < _MOST_PEAKS and distance > _SAME * labelled.shape[-1]:
-            densities.append(_laplace(problem, space, peak))
+            densities.append(laplace(problem, space, peak))
             kept.append(peak)
     return np.array(kept)
 
@@ -310,11 +311,11 @@ def weigh_draws_about_peaks(
     assert isinstance(problem.prior, SSFPrior)
     space, densities, log_z, n_calls = LightContrasts(problem.prior), [], [], 0
     for peak in peaks:
-        density, own = _laplace(problem, space, peak), -math.inf
+        density, own = laplace(problem, space, peak), -math.inf
         for _ in range(_N_ROUNDS):
             y, theta, log_density = _MixtureAboutPeaks(space, [density], np.ones(1)).draw(_N_PILOTS, rng)
             if len(y) < 2 * y.shape[1]:
-                density = _StudentTDensity(density.mean, 0.5 * density.root)
+                density = StudentTDensity(density.mean, 0.5 * density.root)
                 continue
             log_weight = problem.log_likelihood(theta) - log_density
             n_calls += len(y)
@@ -338,15 +339,8 @@ def weigh_draws_about_peaks(
     return replace(found, log_z_error=error, n_calls=n_calls + len(theta)), log_weight_at
 
 
-def _laplace(problem: SensorProblem, space: LightContrasts, peak: FloatArray) -> _StudentTDensity:
-    at, covariance = laplace(problem, space, peak)
-    return _StudentTDensity(at, np.asarray(np.linalg.cholesky(_WIDENED**2 * covariance)))
-
-
-def laplace(
-    problem: SensorProblem, space: Coordinates | LightContrasts, peak: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return a peak, (6 N + 2,), in the coordinates, (d,), and the covariance by the curvature there, (d, d).
+def laplace(problem: SensorProblem, space: Coordinates | LightContrasts, peak: FloatArray) -> StudentTDensity:
+    """Return the density about a peak, (6 N + 2,), by the curvature there.
 
     Along coordinates of little information it has the prior's width.
     """
@@ -358,4 +352,5 @@ def laplace(
     predicted = problem.model.predict(theta, recording.plan)[:, recording.usable]
     slope = (predicted[1:] - predicted[0]) / _DIFFERENCE
     weight = likelihood.inverse_noise_variance(recording.readings[recording.usable] - predicted[:1])[0]
-    return at, np.linalg.inv((slope * weight) @ slope.T + np.diag(1.0 / wide))
+    covariance = np.linalg.inv((slope * weight) @ slope.T + np.diag(1.0 / wide))
+    return StudentTDensity(at, np.asarray(np.linalg.cholesky(_WIDENED**2 * covariance)))

@@ -125,12 +125,6 @@ def test_a_sensor_file_of_before_counts_from_0(make_sensor):
             FittedSensor.from_json(json.dumps(document | {"origins": damaged}))
 
 
-def test_another_unit_is_warned_of(sensor):
-    plan = replace(_disc_plan(), instrumentation=Instrumentation(unit="mW"))
-    with pytest.warns(DoubtfulResultWarning, match="'mW'"):
-        predict(sensor, plan)
-
-
 def test_heights_without_one_in_the_description_are_warned_of(sensor):
     calibrated = replace(sensor, instrumentation=replace(sensor.instrumentation, height_mm=14.0))
     raised = replace(_disc_plan(), covariates={"height_mm": np.full(21, 28.0)})
@@ -158,15 +152,13 @@ def test_a_plan_that_declares_another_height_is_predicted_at_it(sensor):
     np.testing.assert_array_equal(predict(sensor, at_28).mean, predict(sensor, at_14).mean)  # calibrated at no height
 
 
-def test_a_plan_without_the_battery_that_an_effect_reads_is_warned_of(make_sensor):
-    plain = make_sensor()
-    columns = np.append(plain.samples, np.full((len(plain.samples), 1), 0.05), axis=1)
-    names = (*plain.names, "battery_sag.per_volt")
-    sags = replace(plain, names=names, samples=columns, effects=("battery_sag",))
-    plan = paper_plan()
+def test_a_plan_without_the_battery_that_an_effect_reads_or_in_another_unit_is_warned_of(make_sensor):
+    sags, plan = make_sensor(effects=("battery_sag",), extra={"battery_sag.per_volt": 0.05}), paper_plan()
     predict(sags, plan)  # knows its battery
     with pytest.warns(DoubtfulResultWarning, match="no column battery_mv, which battery_sag reads"):
         predict(sags, replace(plan, covariates={}))
+    with pytest.warns(DoubtfulResultWarning, match="'mW'"):
+        predict(sags, replace(plan, instrumentation=Instrumentation(unit="mW")))
 
 
 def test_a_plan_without_rows_predicts_nothing_and_readings_that_do_not_match_are_refused(sensor):

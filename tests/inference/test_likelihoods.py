@@ -1,7 +1,5 @@
 """Likelihoods against quadrature and by hand."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -29,7 +27,7 @@ from probewise.priors import Product, Uniform
 from probewise.recordings.plan import Instrumentation, Plan, Recording
 
 
-def recording(readings: list[float], scan: list[int] | None = None, **inst: float) -> Recording:
+def recording(readings, scan=None, **inst):
     n = len(readings)
     codes = [0] * n if scan is None else scan
     plan = Plan(
@@ -51,14 +49,14 @@ class Line:
 
     names = ("slope", "start")
 
-    def predict(self, theta: np.ndarray, plan: Plan) -> np.ndarray:
+    def predict(self, theta, plan):
         return theta[:, :1] * plan.x_mm + theta[:, 1:2]
 
 
-def by_quadrature(square: float, n: int, low: float, high: float) -> float:
+def by_quadrature(square, n, low, high):
     """The integral over ln sigma by Gauss and Legendre, in panels that widen away from the peak."""
 
-    def height(s: np.ndarray) -> np.ndarray:
+    def height(s):
         return -n * s - 0.5 * square * np.exp(-2 * s)
 
     a, b = math.log(low), math.log(high)
@@ -75,17 +73,17 @@ def by_quadrature(square: float, n: int, low: float, high: float) -> float:
 
 @pytest.mark.parametrize("n", [1, 2, 4, 14, 101, 404, 5000])
 @pytest.mark.parametrize("rms", [0.0, 1e-9, 1e-3, 0.04, 0.6, 5.0, 80.0, 3000.0])
-def test_the_integral_over_sigma_is_what_quadrature_gives(n: int, rms: float) -> None:
+def test_the_integral_over_sigma_is_what_quadrature_gives(n, rms):
     """From residuals that vanish to residuals far beyond the ceiling."""
     got = float(log_sigma_integral(n * rms**2, n, 0.05, 60.0))
     assert got == pytest.approx(by_quadrature(n * rms**2, n, 0.05, 60.0), rel=1e-9, abs=1e-8)
 
 
-def test_student_t_is_a_normalised_density_of_one_reading() -> None:
+def test_student_t_is_a_normalised_density_of_one_reading():
     """With a proper prior of sigma one reading says something, and its density integrates to one."""
     one = StudentT(np.zeros(1), 0.5, 20.0)
 
-    def density(reading: float) -> float:
+    def density(reading):
         return math.exp(one.log_prob(np.array([reading]), np.zeros((1, 1)))[0])
 
     halves = [quad(density, a, b, epsabs=1e-10)[0] for a, b in ((0, 1), (1, 10), (10, 200))]
@@ -93,7 +91,7 @@ def test_student_t_is_a_normalised_density_of_one_reading() -> None:
     assert density(0.0) > density(1.0) > density(5.0)
 
 
-def test_student_t_multiplies_over_data_sets() -> None:
+def test_student_t_multiplies_over_data_sets():
     """Paper: the joint likelihood is the product over data sets."""
     rng = np.random.default_rng(1)
     readings, predicted = rng.normal(size=9), rng.normal(size=(3, 9))
@@ -106,7 +104,7 @@ def test_student_t_multiplies_over_data_sets() -> None:
     assert whole == pytest.approx(parts, abs=1e-12)
 
 
-def test_gaussian_likelihoods_add_up_normal_densities() -> None:
+def test_gaussian_likelihoods_add_up_normal_densities():
     rng = np.random.default_rng(2)
     readings, predicted = rng.normal(size=6), rng.normal(size=(4, 6))
     sd = rng.uniform(0.5, 2, 6)
@@ -117,7 +115,7 @@ def test_gaussian_likelihoods_add_up_normal_densities() -> None:
     )
 
 
-def test_a_few_hypotheses_at_a_time_are_weighed_as_all_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_few_hypotheses_at_a_time_are_weighed_as_all_at_once(monkeypatch):
     rec = recording([0.1, 1.2, float("nan"), 2.9])
     sensor = Product({"slope": Uniform(0, 2), "start": Uniform(-1, 1)})
     problem = SensorProblem(sensor, Line(), GaussianKnown(0.5), rec)
@@ -127,7 +125,7 @@ def test_a_few_hypotheses_at_a_time_are_weighed_as_all_at_once(monkeypatch: pyte
     assert problem.log_likelihood(theta) == pytest.approx(together)
 
 
-def test_the_naive_likelihood_knows_two_levels() -> None:
+def test_the_naive_likelihood_knows_two_levels():
     """Paper, naive likelihood, with the exponent's sign and the square of sigma put right."""
     naive = Naive(mu_black=10, sd_black=1, mu_white=60, sd_white=3)
     readings = np.array([11.0, 58.0, 30.0])
@@ -137,14 +135,14 @@ def test_the_naive_likelihood_knows_two_levels() -> None:
     assert got[1] == pytest.approx(norm.logpdf(readings, 10, 1).sum())
 
 
-def test_the_naive_levels_come_from_known_black_and_white() -> None:
+def test_the_naive_levels_come_from_known_black_and_white():
     naive = Naive.estimated([10, 10, 10], [58, 60, 62], sd_floor=0.3)
     assert (naive.mu_black, naive.sd_black, naive.mu_white, naive.sd_white) == (10, 0.3, 60, 2)
     with pytest.raises(ParameterError, match="black"):
         Naive.estimated([10], [58, 60], sd_floor=0.3)
 
 
-def test_the_floor_is_that_of_rounding_or_a_thousandth_of_the_span() -> None:
+def test_the_floor_is_that_of_rounding_or_a_thousandth_of_the_span():
     assert sd_floor(recording([10, 60], step=1)) == pytest.approx(1 / math.sqrt(12))
     assert sd_floor(recording([10, 60])) == pytest.approx(0.05)
     assert sd_floor(recording([0, 1000], step=1)) == pytest.approx(1.0)
@@ -153,13 +151,13 @@ def test_the_floor_is_that_of_rounding_or_a_thousandth_of_the_span() -> None:
     assert reading_span(recording([5, 5])) == 1
 
 
-def test_a_data_set_is_a_scan_unless_told_otherwise() -> None:
+def test_a_data_set_is_a_scan_unless_told_otherwise():
     rec = recording([1, 2, float("nan"), 4], scan=[0, 0, 1, 1])
     assert student_t_of(rec).groups.tolist() == [0, 0, 1]
     assert student_t_of(rec, np.array([5, 6, 7, 8])).groups.tolist() == [5, 6, 8]
 
 
-def test_shapes_and_bounds_are_checked() -> None:
+def test_shapes_and_bounds_are_checked():
     with pytest.raises(ParameterError, match="floor"):
         StudentT(np.zeros(3), 1.0, 1.0)
     with pytest.raises(ShapeError, match="groups has 3 values for 4 readings"):
@@ -170,7 +168,7 @@ def test_shapes_and_bounds_are_checked() -> None:
         GaussianKnown(0.0)
 
 
-def test_weights_tell_the_gradient_by_the_predictions() -> None:
+def test_weights_tell_the_gradient_by_the_predictions():
     """Far from the bounds of sigma: central differences of the log likelihood, data sets of 5 and 3 readings."""
     rng = np.random.default_rng(21)
     likelihood = StudentT(np.array([0, 0, 7, 0, 7, 7, 0, 0]), sd_floor=1e-4, sd_ceiling=1e4)

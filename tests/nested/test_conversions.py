@@ -1,7 +1,5 @@
 """Other libraries get the same evidence and the same posterior; without them the error says what to install."""
 
-from __future__ import annotations
-
 import importlib
 import math
 import sys
@@ -10,17 +8,17 @@ import numpy as np
 import pytest
 from nested_sampling import problems
 
-from probewise.nested import NestedResult, merge, run
+from probewise.nested import merge, run
 from probewise.priors import Product, Uniform
 
 WHY = "{0} is an optional package: pip install {0}"
 
 
-def disc() -> object:
+def disc():
     """Impossible outside a disc, two levels of likelihood within."""
     prior = Product({"x": Uniform(-1, 1), "y": Uniform(-1, 1)})
 
-    def function(theta: np.ndarray) -> np.ndarray:
+    def function(theta):
         r2 = (theta**2).sum(axis=1)
         return np.where(r2 < 0.5, np.where(r2 < 0.1, 1.0, 0.0), -np.inf)
 
@@ -31,14 +29,14 @@ PROBLEMS = {"plateau": problems.plateau, "Rosenbrock 2-D": lambda: problems.rose
 
 
 @pytest.fixture(scope="module", params=[*PROBLEMS, "two runs"])
-def result(request: pytest.FixtureRequest) -> NestedResult:
+def result(request):
     if request.param == "two runs":
         rngs = np.random.default_rng(9).spawn(3)
         return merge([run(problems.plateau(), rng=rng, n_live=50) for rng in rngs[1:]], rng=rngs[0])
     return run(PROBLEMS[request.param](), rng=np.random.default_rng(4), n_live=100)
 
 
-def test_levels_become_strict_in_the_order_of_labels_and_hardly_move(result: NestedResult) -> None:
+def test_levels_become_strict_in_the_order_of_labels_and_hardly_move(result):
     death, birth = result._log_likelihoods_without_ties()
     assert (np.diff(death) > 0).all()
     assert death == pytest.approx(result.log_likelihood + result.log_start, rel=1e-9, abs=1e-9)
@@ -51,7 +49,7 @@ def test_levels_become_strict_in_the_order_of_labels_and_hardly_move(result: Nes
     assert np.array_equal(alive, result.n_at_death)
 
 
-def test_anesthetic_finds_the_same_evidence(result: NestedResult) -> None:
+def test_anesthetic_finds_the_same_evidence(result):
     pytest.importorskip("anesthetic", reason=WHY.format("anesthetic"), exc_type=ImportError)
     samples = result.to_anesthetic()
     assert len(samples) == result.n_dead
@@ -67,9 +65,7 @@ def test_anesthetic_finds_the_same_evidence(result: NestedResult) -> None:
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::FutureWarning")  # ArviZ warns of its own successor on import
 @pytest.mark.parametrize("module", ["arviz", "arviz_base"])
-def test_arviz_gets_equally_weighted_samples_with_their_levels(
-    module: str, result: NestedResult, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_arviz_gets_equally_weighted_samples_with_their_levels(module, result, monkeypatch):
     """ArviZ up to 0.23 and, by its base package, from 1.0 on."""
     pytest.importorskip(module, reason=WHY.format(module), exc_type=ImportError)
     monkeypatch.setitem(sys.modules, "arviz", importlib.import_module(module))
@@ -88,9 +84,7 @@ def test_arviz_gets_equally_weighted_samples_with_their_levels(
 
 
 @pytest.mark.parametrize("name", ["anesthetic", "arviz"])
-def test_a_missing_package_is_named_with_its_install_line(
-    name: str, result: NestedResult, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_package_is_named_with_its_install_line(name, result, monkeypatch):
     monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(ImportError, match=f"pip install {name}$"):
         result.to_anesthetic() if name == "anesthetic" else result.to_arviz(rng=np.random.default_rng(0))

@@ -1,7 +1,5 @@
 """Metropolis-Hastings steps that break replications (paper: about 1000 of them)."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from nested_sampling import problems
@@ -10,7 +8,7 @@ from probewise.errors import ParameterError, ShapeError
 from probewise.nested import diversify
 
 
-def test_replicated_samples_become_independent() -> None:
+def test_replicated_samples_become_independent():
     """Fifty copies of two points become fifty draws of a correlated Gaussian, forty clouds pooled for the test."""
     problem = problems.gaussian(3, correlation=0.8)
     rng = np.random.default_rng(11)
@@ -29,7 +27,7 @@ def test_replicated_samples_become_independent() -> None:
     assert first.mean(axis=0) == pytest.approx(second.mean(axis=0), abs=0.45)
 
 
-def test_exact_draws_stay_exact_draws_and_forget_where_they_began() -> None:
+def test_exact_draws_stay_exact_draws_and_forget_where_they_began():
     problem = problems.gaussian(2, correlation=0.9)
     rng = np.random.default_rng(12)
     start = rng.multivariate_normal([0, 0], [[1, 0.9], [0.9, 1]], size=2000)
@@ -40,7 +38,7 @@ def test_exact_draws_stay_exact_draws_and_forget_where_they_began() -> None:
     assert ((end - start) ** 2).mean() / 2 == pytest.approx(1.0, abs=0.15)
 
 
-def test_samples_pass_between_modes() -> None:
+def test_samples_pass_between_modes():
     problem = problems.mixture_of_far_peaks(2)
     rng = np.random.default_rng(13)
     start = np.concatenate([rng.normal(0.3, 0.02, (150, 2)), rng.normal(0.7, 0.02, (50, 2))])
@@ -48,8 +46,8 @@ def test_samples_pass_between_modes() -> None:
     assert (end[:, 0] > 0.5).mean() == pytest.approx(0.75, abs=0.14)
 
 
-def test_the_likelihood_is_never_asked_outside_the_prior() -> None:
-    def function(theta: np.ndarray) -> np.ndarray:
+def test_the_likelihood_is_never_asked_outside_the_prior():
+    def function(theta):
         assert ((theta >= 0) & (theta <= 1)).all()
         return np.zeros(len(theta))
 
@@ -58,7 +56,7 @@ def test_the_likelihood_is_never_asked_outside_the_prior() -> None:
     assert ((end >= 0) & (end <= 1)).all()
 
 
-def test_an_impossible_sample_or_a_wrong_shape_is_refused() -> None:
+def test_an_impossible_sample_or_a_wrong_shape_is_refused():
     rng = np.random.default_rng(0)
     with pytest.raises(ParameterError, match=r"theta\[1\]"):
         diversify(np.array([[0.5, 0.5], [1.5, 0.5]]), problems.plateau(), rng=rng)

@@ -3,8 +3,6 @@
 With another seed (`PROBEWISE_FACTS_SEED`) a right sampler fails about once in 10 000.
 """
 
-from __future__ import annotations
-
 import os
 
 import numpy as np
@@ -19,7 +17,7 @@ SEED = int(os.environ.get("PROBEWISE_FACTS_SEED", "20261124"))
 CHANCE = 1e-4
 
 
-def line(rng: np.random.Generator) -> tuple[Known, np.ndarray]:
+def line(rng):
     """Draw a truth from the prior and ten readings of its line; the problem has the closed log evidence."""
     truth, x = rng.standard_normal(2), np.linspace(-1, 1, 10)
     design = np.stack([x, np.ones(10)], axis=1)
@@ -31,7 +29,7 @@ def line(rng: np.random.Generator) -> tuple[Known, np.ndarray]:
 
 
 @pytest.mark.slow
-def test_truths_lie_evenly_in_their_posteriors_and_evidences_scatter_as_claimed() -> None:
+def test_truths_lie_evenly_in_their_posteriors_and_evidences_scatter_as_claimed():
     """bilby's p-p test and simulation-based calibration (Talts et al. 2018), with the evidence's errors besides.
 
     Over 200 truths drawn from the prior the truth's posterior quantile is uniform, for both parameters, and the sum of

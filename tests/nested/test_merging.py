@@ -1,7 +1,5 @@
 """Merged runs: counts by births and deaths against counts kept by the sampler, evidences against known ones."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 
@@ -10,44 +8,40 @@ import pytest
 from nested_sampling import problems
 
 from probewise.errors import DoubtfulResultWarning, ParameterError
-from probewise.nested import NestedResult, merge, run
+from probewise.nested import merge, run
 from probewise.nested.result import n_alive_at_death
 from probewise.priors import Product, Uniform
 
 N_ERRORS = 3.9
 
 
-def several(
-    problem: object, n_runs: int, *, n_live: int = 50, seed: int = 5, max_cost: float = 5.0
-) -> list[NestedResult]:
+def several(problem, n_runs, *, n_live=50, seed=5, max_cost=5.0):
     spawned = np.random.default_rng(seed).spawn(n_runs)
     return [run(problem, rng=rng, n_live=n_live, max_cost=max_cost) for rng in spawned]
 
 
 @pytest.fixture(scope="module")
-def terraces() -> list[NestedResult]:
+def terraces():
     return several(problems.plateau(), 8)
 
 
 @pytest.fixture
-def rng() -> np.random.Generator:
+def rng():
     return np.random.default_rng(11)
 
 
-def alive(result: NestedResult) -> np.ndarray:
+def alive(result):
     return n_alive_at_death(result.log_likelihood, result.label, result.log_birth, result.birth_label)
 
 
 @pytest.mark.parametrize("name", ["plateau", "naive steps", "Rosenbrock 2-D"])
 @pytest.mark.parametrize("n_replaced", [pytest.param(1, marks=pytest.mark.slow), 7])
-def test_births_and_deaths_alone_give_the_count_that_the_sampler_kept(name: str, n_replaced: int) -> None:
+def test_births_and_deaths_alone_give_the_count_that_the_sampler_kept(name, n_replaced):
     result = run(problems.PROBLEMS[name](), rng=np.random.default_rng(1), n_live=20, n_replaced=n_replaced)
     assert np.array_equal(alive(result), result.n_at_death)
 
 
-def test_merged_runs_are_one_run_with_the_live_points_of_all(
-    terraces: list[NestedResult], rng: np.random.Generator
-) -> None:
+def test_merged_runs_are_one_run_with_the_live_points_of_all(terraces, rng):
     merged = merge(terraces, rng=rng)
     assert merged.n_live == 400 == merged.n_at_death[0]
     assert merged.n_dead == sum(r.n_dead for r in terraces)
@@ -60,7 +54,7 @@ def test_merged_runs_are_one_run_with_the_live_points_of_all(
     assert merged.memory == pytest.approx(np.mean([r.memory for r in terraces]))
 
 
-def test_runs_of_different_live_points_and_ends_are_merged(rng: np.random.Generator) -> None:
+def test_runs_of_different_live_points_and_ends_are_merged(rng):
     problem = problems.gaussian(2, 0.5)
     one, two = (run(problem, rng=np.random.default_rng(n), n_live=n) for n in (40, 120))
     with pytest.warns(DoubtfulResultWarning, match="max_calls"):
@@ -77,7 +71,7 @@ def test_runs_of_different_live_points_and_ends_are_merged(rng: np.random.Genera
     assert abs(joined.log_z - problem.log_z) < N_ERRORS * joined.log_z_error
 
 
-def test_merging_in_two_stages_is_merging_at_once(terraces: list[NestedResult]) -> None:
+def test_merging_in_two_stages_is_merging_at_once(terraces):
     halves = [merge(part, rng=np.random.default_rng(0)) for part in (terraces[:3], terraces[3:])]
     staged, at_once = (merge(parts, rng=np.random.default_rng(0)) for parts in (halves, terraces))
     assert staged.log_z == at_once.log_z
@@ -87,7 +81,7 @@ def test_merging_in_two_stages_is_merging_at_once(terraces: list[NestedResult]) 
         merge([halves[0], terraces[1]], rng=np.random.default_rng(0))
 
 
-def test_the_possible_share_of_the_prior_is_pooled(rng: np.random.Generator) -> None:
+def test_the_possible_share_of_the_prior_is_pooled(rng):
     """A ball in a box: a pooled share of found over drawn, and the evidence is the share."""
     prior = Product({"x": Uniform(-1, 1), "y": Uniform(-1, 1)})
     disc = problems.Known(prior, lambda t: np.where((t**2).sum(axis=1) < 0.5, 0.0, -np.inf), math.log(math.pi / 8))
@@ -101,7 +95,7 @@ def test_the_possible_share_of_the_prior_is_pooled(rng: np.random.Generator) -> 
     assert "of the prior" in merged.summary()
 
 
-def test_runs_that_disagree_say_so_and_widen_the_error(terraces: list[NestedResult], rng: np.random.Generator) -> None:
+def test_runs_that_disagree_say_so_and_widen_the_error(terraces, rng):
     far = [terraces[0], terraces[1], dataclasses.replace(terraces[2], log_z=terraces[2].log_z + 3)]
     with pytest.warns(DoubtfulResultWarning, match="3 runs disagree more than their errors"):
         merged = merge(far, rng=rng)
@@ -110,9 +104,7 @@ def test_runs_that_disagree_say_so_and_widen_the_error(terraces: list[NestedResu
     assert "doubtful: the 3 runs disagree" in merged.summary()
 
 
-def test_what_is_no_independent_run_of_the_same_problem_is_refused(
-    terraces: list[NestedResult], rng: np.random.Generator
-) -> None:
+def test_what_is_no_independent_run_of_the_same_problem_is_refused(terraces, rng):
     one, two = terraces[:2]
     with pytest.raises(ParameterError, match="1 runs"):
         merge([one], rng=rng)

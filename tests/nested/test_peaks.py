@@ -1,7 +1,5 @@
 """Peaks that a run missed are found, then weighed and won back by its check; where there are none, little is spent."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -9,11 +7,11 @@ import numpy as np
 import pytest
 from nested_sampling import hard, problems
 
-from probewise.nested import NestedResult, SliceMove
+from probewise.nested import SliceMove
 from probewise.nested.check import check_and_repeat, climb_to_top, find_missed_peaks, peak_of_last_live_points
 from probewise.nested.clusters import Clusters
 from probewise.nested.moves import HoppingMove
-from probewise.nested.problem import Bound, Evaluator, Samplable
+from probewise.nested.problem import Bound, Evaluator
 from probewise.nested.sampler import run_once
 
 SHARE = 0.6
@@ -26,44 +24,44 @@ class Two:
     veil: float = math.inf
 
     @property
-    def prior(self) -> problems.Product:
+    def prior(self):
         return problems.box(4, -1, 1)
 
     @property
-    def log_z(self) -> float:
+    def log_z(self):
         return -4 * math.log(2.0)
 
-    def log_likelihood(self, theta: np.ndarray) -> np.ndarray:
+    def log_likelihood(self, theta):
         norm = -4 * (math.log(0.02) + 0.5 * problems.LOG_2PI)
         first, second = (-0.5 * ((theta - at) ** 2).sum(axis=1) / 0.02**2 + norm for at in (-0.4, 0.5))
         return np.asarray(np.logaddexp(first + math.log(1 - SHARE), np.minimum(second + math.log(SHARE), self.veil)))
 
 
 @pytest.fixture(scope="module")
-def robbed() -> NestedResult:
+def robbed():
     """A run that saw the second mode up to 60 nats below its top, from where on there were no live points in it."""
     return run_once(Two(veil=-50.0), rng=np.random.default_rng(1), n_live=100)
 
 
-def missing_from(run: NestedResult, problem: Samplable) -> tuple[list[np.ndarray], int]:
+def missing_from(run, problem):
     """Samples about the peaks that a run has missed, and the evaluations that they cost."""
     evaluate = Evaluator(problem)
     found = find_missed_peaks(run, evaluate, max_calls=10 * run.n_calls, rng=np.random.default_rng(2))
     return found, evaluate.n_calls
 
 
-def checked(run: NestedResult, problem: Samplable, max_cost: float) -> NestedResult:
+def checked(run, problem, max_cost):
     rng = np.random.default_rng(3)
     return check_and_repeat(
         run, Evaluator(problem), SliceMove(), run_once, max_cost=max_cost, max_calls=None, least_live=20, rng=rng
     )
 
 
-def share_of_second(run: NestedResult) -> float:
+def share_of_second(run):
     return float(run.weight[run.theta.mean(axis=1) > 0.05].sum())
 
 
-def test_a_mode_without_live_points_is_found_as_wide_as_it_is(robbed: NestedResult) -> None:
+def test_a_mode_without_live_points_is_found_as_wide_as_it_is(robbed):
     assert share_of_second(robbed) < 1e-6
     (theta,), n_calls = missing_from(robbed, Two())
     assert np.allclose(theta.mean(axis=0), 0.5, atol=0.01)
@@ -71,7 +69,7 @@ def test_a_mode_without_live_points_is_found_as_wide_as_it_is(robbed: NestedResu
     assert n_calls < robbed.n_calls / 3
 
 
-def test_a_lost_mode_is_won_back_by_hops_to_it(robbed: NestedResult) -> None:
+def test_a_lost_mode_is_won_back_by_hops_to_it(robbed):
     result = checked(robbed, Two(), 5.0)
     assert not result.warnings
     assert abs(result.log_z - Two().log_z) < 3.9 * result.log_z_error
@@ -80,7 +78,7 @@ def test_a_lost_mode_is_won_back_by_hops_to_it(robbed: NestedResult) -> None:
     assert result.n_calls <= 5 * robbed.n_calls
 
 
-def test_a_lost_mode_that_cannot_be_won_back_within_the_limit_is_a_doubt(robbed: NestedResult) -> None:
+def test_a_lost_mode_that_cannot_be_won_back_within_the_limit_is_a_doubt(robbed):
     """By a second estimate of the whole, whose posterior has 0.6 in the mode; its log Z is right to its error."""
     result = checked(robbed, Two(), 1.9)
     assert result.log_z == robbed.log_z
@@ -93,7 +91,7 @@ def test_a_lost_mode_that_cannot_be_won_back_within_the_limit_is_a_doubt(robbed:
 
 
 @pytest.mark.parametrize("name", ["Gaussian 4-D", "circle", "shells 2-D", "eggbox"])
-def test_where_nothing_was_missed_nothing_is_doubted_for_a_third_of_the_cost(name: str) -> None:
+def test_where_nothing_was_missed_nothing_is_doubted_for_a_third_of_the_cost(name):
     known = problems.problem(name)
     run = run_once(known, rng=np.random.default_rng(4), n_live=100)
     missing, n_calls = missing_from(run, known)
@@ -102,7 +100,7 @@ def test_where_nothing_was_missed_nothing_is_doubted_for_a_third_of_the_cost(nam
 
 
 @pytest.mark.slow
-def test_a_spike_that_no_live_point_met_is_found_and_doubts_the_run() -> None:
+def test_a_spike_that_no_live_point_met_is_found_and_doubts_the_run():
     """Nine of ten such spikes are found, so that all three seeds miss theirs once in a thousand."""
     known = hard.spike_on_slab()
     right = []
@@ -115,7 +113,7 @@ def test_a_spike_that_no_live_point_met_is_found_and_doubts_the_run() -> None:
     assert any(right)
 
 
-def test_the_top_of_a_bent_peak_is_met_to_a_hundredth_of_a_nat() -> None:
+def test_the_top_of_a_bent_peak_is_met_to_a_hundredth_of_a_nat():
     known = problems.problem("Rosenbrock 2-D")
     run = run_once(known, rng=np.random.default_rng(1), n_live=100)
     evaluate = Evaluator(known)
@@ -126,10 +124,10 @@ def test_the_top_of_a_bent_peak_is_met_to_a_hundredth_of_a_nat() -> None:
     assert evaluate.n_calls < run.n_calls / 5
 
 
-def test_hops_hold_the_share_of_each_mode_and_reach_it_from_another() -> None:
+def test_hops_hold_the_share_of_each_mode_and_reach_it_from_another():
     """Above a bound two squares' areas are known: 0.04 and 0.01 of 0.05. Four sds, one false alarm in 16,000 each."""
 
-    def function(theta: np.ndarray) -> np.ndarray:
+    def function(theta):
         large, small = (np.abs(theta - at).max(axis=1) < half for at, half in ((0.3, 0.1), (0.8, 0.05)))
         return np.where(large | small, 0.0, -1.0)
 

@@ -1,7 +1,5 @@
 """The benchmark's problems against second routes to their evidence, and its bookkeeping."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -11,14 +9,12 @@ from scipy.special import logsumexp
 
 
 @pytest.fixture
-def rng() -> np.random.Generator:
+def rng():
     return np.random.default_rng(20240229)
 
 
 @pytest.mark.parametrize("n_gaussians", [1, 2, 4])
-def test_the_ssf_likelihood_is_the_one_written_down_from_the_formulas(
-    n_gaussians: int, rng: np.random.Generator
-) -> None:
+def test_the_ssf_likelihood_is_the_one_written_down_from_the_formulas(n_gaussians, rng):
     """Closed forms and incomplete gammas of the package against quadratures, every constant included."""
     known = problems.ssf(n_gaussians)
     u = rng.random((200, known.n_params))
@@ -41,7 +37,7 @@ IN_TWO = ("shells 2-D", "eggbox", "LogGamma 2-D", "plateau", "Rosenbrock 2-D", "
         ),
     ],
 )
-def test_evidence_and_moments_agree_with_a_fine_grid(name: str, n: int, error: float) -> None:
+def test_evidence_and_moments_agree_with_a_fine_grid(name, n, error):
     """Midpoint rule on n x n cells of the unit square."""
     known = hard.IN_TWO[name]() if name in hard.IN_TWO else problems.problem(name)
     side = (np.arange(n) + 0.5) / n

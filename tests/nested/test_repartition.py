@@ -1,7 +1,5 @@
 """A second run from a prior near the posterior: the evidence is what quadrature has, and sharper."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

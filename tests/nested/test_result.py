@@ -1,10 +1,7 @@
 """Results: what they compute from weighted samples, and their file."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,11 +12,11 @@ from probewise.nested import NestedResult, run
 
 
 @pytest.fixture(scope="module")
-def result() -> NestedResult:
+def result():
     return run(problems.gaussian(2, 0.5), rng=np.random.default_rng(3), n_live=100)
 
 
-def test_a_saved_result_comes_back_whole(result: NestedResult, tmp_path: Path) -> None:
+def test_a_saved_result_comes_back_whole(result, tmp_path):
     doubtful = dataclasses.replace(result, warnings=("a doubt",))
     doubtful.save(tmp_path / "run.npz")
     back = NestedResult.load(tmp_path / "run.npz")
@@ -30,7 +27,7 @@ def test_a_saved_result_comes_back_whole(result: NestedResult, tmp_path: Path) -
     assert [p.name for p in tmp_path.iterdir()] == ["run.npz"]
 
 
-def test_a_file_with_a_wrong_byte_is_refused_or_read_as_it_was(result: NestedResult, tmp_path: Path) -> None:
+def test_a_file_with_a_wrong_byte_is_refused_or_read_as_it_was(result, tmp_path):
     path = tmp_path / "run.npz"
     result.save(path)
     whole = path.read_bytes()
@@ -46,9 +43,7 @@ def test_a_file_with_a_wrong_byte_is_refused_or_read_as_it_was(result: NestedRes
     assert refused > 100
 
 
-def test_a_file_of_another_format_says_so_even_where_its_arrays_have_other_names(
-    result: NestedResult, tmp_path: Path
-) -> None:
+def test_a_file_of_another_format_says_so_even_where_its_arrays_have_other_names(result, tmp_path):
     path = tmp_path / "run.npz"
     np.savez(path, head=np.array('{"format": "nested-result/1"}'), theta=np.zeros(1))
     with pytest.raises(FileError, match=r"nested-result/1.*make the file anew"):
@@ -70,7 +65,7 @@ def test_a_file_of_another_format_says_so_even_where_its_arrays_have_other_names
             NestedResult.load(path)
 
 
-def test_equally_weighted_samples_follow_the_weights(result: NestedResult) -> None:
+def test_equally_weighted_samples_follow_the_weights(result):
     weight = np.zeros(result.n_dead)
     weight[[3, 5]] = 0.25, 0.75
     with np.errstate(divide="ignore"):
@@ -81,7 +76,7 @@ def test_equally_weighted_samples_follow_the_weights(result: NestedResult) -> No
     assert known.mean() == pytest.approx(0.25 * result.theta[3] + 0.75 * result.theta[5])
 
 
-def test_quantiles_of_equal_weights_are_the_plain_ones(result: NestedResult) -> None:
+def test_quantiles_of_equal_weights_are_the_plain_ones(result):
     n = result.n_dead
     plain = dataclasses.replace(result, log_weight=np.full(n, -np.log(n)))
     assert plain.quantiles([0.2, 0.5]) == pytest.approx(np.quantile(result.theta, [0.2, 0.5], axis=0, method="hazen"))

@@ -51,14 +51,10 @@ def cube(prior, n=200, seed=0):
 
 @pytest.mark.parametrize("prior", PRIORS.values(), ids=PRIORS)
 def test_a_point_of_the_unit_cube_is_found_again_from_its_parameters(prior):
-    u = cube(prior)
-    np.testing.assert_allclose(prior.to_unit_cube(prior.from_unit_cube(u)), u, atol=1e-7)
-
-
-@pytest.mark.parametrize("prior", PRIORS.values(), ids=PRIORS)
-def test_what_lies_outside_a_prior_goes_to_the_wall_of_its_cube_and_never_beyond(prior):
     """Rounding may push a sample over its prior's edge; chains must still find it in the cube."""
-    theta = prior.from_unit_cube(cube(prior))
+    u = cube(prior)
+    theta = prior.from_unit_cube(u)
+    np.testing.assert_allclose(prior.to_unit_cube(theta), u, atol=1e-7)
     for moved in (theta * (1 + 1e-12), theta * (1 - 1e-12)):
         u = prior.to_unit_cube(moved)
         assert ((u >= 0) & (u <= 1)).all()

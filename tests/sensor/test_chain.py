@@ -168,10 +168,6 @@ def test_effects_stack_in_the_order_of_the_stages_whatever_the_order_given():
         columns = np.array([[sizes[effect.name] for effect in chain.effects]])
         found = chain.predict(np.concatenate([theta, np.repeat(columns, 4, axis=0)], axis=1), plan)
         assert found == pytest.approx(wanted, abs=1e-9)
-
-
-def test_effects_that_cannot_be_are_refused():
-    base = CHAINS["one_free"][0]
     with pytest.raises(ParameterError, match="each name once"):
         base.with_effects(GAIN, GAIN)
 

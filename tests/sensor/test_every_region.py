@@ -49,7 +49,7 @@ def test_every_kind_of_region_is_here():
 def test_a_footprint_is_seen_alike_by_closed_form_and_by_the_papers_sum(kind):
     """And it has a closed form: without one the sensor warns, which fails here."""
     cov = np.array([[16.0, 3.0], [3.0, 9.0]])
-    grid = np.arange(-25.0, 25.125, 0.25)
+    grid = np.arange(-25.0, 25.25, 0.5)
     ssf = FixedMixture([1.0], [[0.0, 0.0]], [cov])
     field = mean_ssf_field(ssf.footprint(np.empty((1, 0))), u_mm=grid, v_mm=grid)
     x, y = np.array([[-6.0, 0.0, 2.0, 12.0]]), np.array([[3.0, -2.0, 8.0, 4.0]])
@@ -57,7 +57,7 @@ def test_a_footprint_is_seen_alike_by_closed_form_and_by_the_papers_sum(kind):
     closed = mean_albedo_under_gaussians(
         KINDS[kind], x[..., None], y[..., None], *(np.full((1, 1, 1), c) for c in (16.0, 9.0, 3.0))
     )
-    np.testing.assert_allclose(closed[:, :, 0], by_pixels, atol=4e-4)
+    np.testing.assert_allclose(closed[:, :, 0], by_pixels, atol=1.6e-3)
     assert kind in registered(mean_albedo_under_one_gaussian)
 
 

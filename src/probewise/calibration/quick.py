@@ -195,10 +195,10 @@ def fit_orders_quickly(
         now = found[n].evidence_result
         fallen = best - now.log_z > max(_FALLEN, _N_ERRORS * now.log_z_error)
     while (chosen := max(found, key=lambda n: found[n].evidence_result.log_z)) in log_weight_at:
-        weigh, made = log_weight_at.pop(chosen), found[chosen].result
-        n_live = max(_VOUCHING_LIVE, _VOUCHING_PER_PARAM * len(made.names))
+        weigh, quickly = log_weight_at.pop(chosen), found[chosen].result
+        n_live = max(_VOUCHING_LIVE, _VOUCHING_PER_PARAM * len(quickly.names))
         seen = _run_silently(problems.problem(chosen), n_live, rng, progress)
-        why = _missed_part_in_words(made, weigh, seen, rng)
+        why = _missed_part_in_words(quickly, weigh, seen, rng)
         for n in [n for n in found if why and n >= chosen]:
             log_weight_at.pop(n, None)
             full = search(n, rng)

@@ -10,7 +10,6 @@ from nested_sampling import hard, problems
 from probewise.nested import SliceMove
 from probewise.nested.check import check_and_repeat, climb_to_top, find_missed_peaks, peak_of_last_live_points
 from probewise.nested.clusters import Clusters
-from probewise.nested.moves import HoppingMove
 from probewise.nested.problem import Bound, Evaluator
 from probewise.nested.sampler import run_once
 
@@ -136,7 +135,7 @@ def test_hops_hold_the_share_of_each_mode_and_reach_it_from_another():
     modes = Clusters.from_groups(
         [0.3 + 0.1 * rng.standard_normal((300, 2)), 0.8 + 0.05 * rng.standard_normal((300, 2))]
     )
-    move = HoppingMove(SliceMove(hops=0, differences=0.0), modes)
+    move = SliceMove(hops=0, differences=0.0, modes=modes)
     now = evaluate(rng.uniform(0.2, 0.4, (2000, 2)), rng)
     for _ in range(6):
         now, tally = move.draw(now, Bound(-0.5, 0.0), now.u, evaluate, rng)

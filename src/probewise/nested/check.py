@@ -32,7 +32,7 @@ from probewise.errors import NotConvergedError, ParameterError, message_of
 from probewise.nested.clusters import Clusters, find_clusters
 from probewise.nested.evidence import MOST_MEMORY, warning_of_few_lineages, warning_of_few_possible_draws
 from probewise.nested.importance import covariance_root_of_points, repartitioned, root_of_covariance
-from probewise.nested.moves import HoppingMove, Move, SliceMove
+from probewise.nested.moves import Move, SliceMove
 from probewise.nested.problem import Evaluator, Points, Samplable
 from probewise.nested.result import Check, NestedResult
 
@@ -294,8 +294,7 @@ class _Budget:
         # A run is worth a start with its first live points, and twice the evaluations of one round.
         if self.left < n_live * (1 + chain.n_steps(len(problem.prior.names)) * chain.target):
             return None
-        move = chain if modes is None else HoppingMove(chain, modes)
-        found = self.search(problem, n_live=n_live, move=move, max_calls=self.left, rng=self.rng)
+        found = self.search(problem, n_live=n_live, move=replace(chain, modes=modes), max_calls=self.left, rng=self.rng)
         self.spent += found.n_calls
         return found if found.complete else None
 

@@ -352,6 +352,10 @@ class SliceMove:
     points, of their cluster where they form several; along the difference of two live points, within and between
     clusters; a hop, where there are clusters: the affine map between two of them takes the point to its counterpart,
     accepted with the ratio of their volumes, which keeps the share of live points in each mode from drifting.
+
+    `modes`, clusters of the posterior in the sampling coordinates, are hopped between, too, before each chain: among
+    the live points a mode shows only while it has enough for a covariance. Level sets of a mode keep about the same
+    shape far below its top, so the maps serve from where modes separate.
     """
 
     steps_per_param: float = 1.0
@@ -361,6 +365,7 @@ class SliceMove:
     hops: int = _HOPS  # more, where there are clusters
     target: float = 2.5  # candidates of a step on average, to which the width is tuned
     fewest_steps: int = _FEWEST_STEPS
+    modes: Clusters | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         require(self.steps_per_param > 0, "steps_per_param", self.steps_per_param, "greater than 0")
@@ -377,6 +382,12 @@ class SliceMove:
         self, start: Points, bound: Bound, live: FloatArray, evaluate: Evaluator, rng: np.random.Generator
     ) -> tuple[Points, Tally]:
         """Return the ends of one chain from each start, and the tally; see `Move`."""
+        n_before = evaluate.n_calls
+        if self.modes is not None:
+            start = start.copy()
+            for _ in range(_HOPS):
+                _hop_in_place(start, self.modes, bound, evaluate, rng)
+        n_of_hops = evaluate.n_calls - n_before
         chains = SliceChains(start, live, evaluate.space, width=self.width)
         n_hops = self.hops if chains.are_in_clusters else 0
         n_steps = self.n_steps(start.u.shape[1]) + n_hops
@@ -384,7 +395,8 @@ class SliceMove:
         kinds = np.where(lot < self.axes, AXIS, np.where(lot < self.axes + self.differences, DIFFERENCE, FRAME))
         kinds[:, np.linspace(0, n_steps - 1, n_hops).astype(int)] = HOP
         chains.run(kinds, bound, evaluate, rng)
-        return chains.points(), Tally(chains.n_evaluated, chains.n_taken, int((~chains.moved).sum()), chains.n_tried)
+        n_evaluated, n_stuck = chains.n_evaluated + n_of_hops, int((~chains.moved).sum())
+        return chains.points(), Tally(n_evaluated, chains.n_taken, n_stuck, chains.n_tried)
 
     def adapted(self, tally: Tally) -> SliceMove:
         """Return the move with its bracket width adapted towards `target` candidates per step."""
@@ -392,50 +404,21 @@ class SliceMove:
         return replace(self, width=min(max(self.width * math.exp(-0.5 * excess), 0.05), 20.0))
 
 
-@dataclass(frozen=True, eq=False)
-class HoppingMove:
-    """A move that hops between modes, then runs the chains of `chains`, so that no mode dies out among the live points.
-
-    A hop takes a point to its counterpart in another mode, by the affine map between their covariances, and is accepted
-    with the ratio of their volumes (see `SliceMove`). `SliceMove` knows only the modes with enough live points for a
-    covariance; here `modes` are clusters of the posterior, in the sampling coordinates. Level sets of a mode keep about
-    the same shape far below its top, so the maps serve from where modes separate.
-    """
-
-    chains: SliceMove
-    modes: Clusters
-
-    def draw(
-        self, start: Points, bound: Bound, live: FloatArray, evaluate: Evaluator, rng: np.random.Generator
-    ) -> tuple[Points, Tally]:
-        """Return the ends of one chain from each start, and the tally; see `Move`."""
-        n_before, now = evaluate.n_calls, start.copy()
-        for _ in range(_HOPS):
-            self._hop_in_place(now, bound, evaluate, rng)
-        n_hops = evaluate.n_calls - n_before
-        new, tally = self.chains.draw(now, bound, live, evaluate, rng)
-        return new, replace(tally, n_evaluated=tally.n_evaluated + n_hops)
-
-    def _hop_in_place(self, now: Points, bound: Bound, evaluate: Evaluator, rng: np.random.Generator) -> None:
-        """Try one hop of each point to a mode chosen at random from the others; overwrite the points that succeed."""
-        modes = self.modes
-        home = modes.assign(now.u)
-        goal = (home + rng.integers(1, len(modes), size=len(home))) % len(modes)
-        u, log_growth = modes.map_with_log_volume_ratio(now.u, home, goal)
-        # The way back must be the same map.
-        able = evaluate.space.inside_mask(u) & (modes.assign(u) == goal)
-        level = now.log_density - log_growth - rng.standard_exponential(len(home))
-        rows = able.nonzero()[0]
-        theta, log_density = evaluate.space.leave(u[rows])
-        dense = (log_density >= level[rows]).nonzero()[0]
-        rows = rows[dense]
-        tried = evaluate.evaluate_mapped(u[rows], theta[dense], log_density[dense], rng)
-        won = bound.mask_above(tried.log_likelihood, tried.label).nonzero()[0]
-        now.overwrite_rows(rows[won], tried, won)
-
-    def adapted(self, tally: Tally) -> HoppingMove:
-        """Return the move with its chains adapted; see `SliceMove`."""
-        return HoppingMove(self.chains.adapted(tally), self.modes)
+def _hop_in_place(now: Points, modes: Clusters, bound: Bound, evaluate: Evaluator, rng: np.random.Generator) -> None:
+    """Try one hop of each point to a mode chosen at random from the others; overwrite the points that succeed."""
+    home = modes.assign(now.u)
+    goal = (home + rng.integers(1, len(modes), size=len(home))) % len(modes)
+    u, log_growth = modes.map_with_log_volume_ratio(now.u, home, goal)
+    # The way back must be the same map.
+    able = evaluate.space.inside_mask(u) & (modes.assign(u) == goal)
+    level = now.log_density - log_growth - rng.standard_exponential(len(home))
+    rows = able.nonzero()[0]
+    theta, log_density = evaluate.space.leave(u[rows])
+    dense = (log_density >= level[rows]).nonzero()[0]
+    rows = rows[dense]
+    tried = evaluate.evaluate_mapped(u[rows], theta[dense], log_density[dense], rng)
+    won = bound.mask_above(tried.log_likelihood, tried.label).nonzero()[0]
+    now.overwrite_rows(rows[won], tried, won)
 
 
 class Kernels:

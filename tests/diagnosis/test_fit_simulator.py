@@ -213,3 +213,27 @@ def test_where_the_best_fit_lies_beside_what_is_impossible_it_is_fitted_or_refus
     assert len(said) == (told is ValueError)
     with contextlib.suppress(NotConvergedError):
         diagnose_system(line(simulate=simulate), {"x": X, "y": Y}, rng=np.random.default_rng(1))
+
+
+def _warmed(p, tau_s, data):
+    return p["start_c"] + p["gain"] * (1 - np.exp(-data["t_s"] / tau_s))
+
+
+@pytest.mark.parametrize(
+    "simulate",
+    [
+        lambda p, data: _warmed(p, np.round(p["tau_s"], 1), data),
+        lambda p, data: _warmed(p, max(int(p["tau_s"]), 1), data),
+    ],
+    ids=["rounds", "counts"],
+)
+def test_a_parameter_that_simulate_rounds_or_counts_by_is_fitted_and_nothing_else_is_named(simulate):
+    """Small steps of tau change nothing; it is 40.0, and its sd 0.1."""
+    parameters = {"tau_s": ("log", 1, 1000), "gain": (0, 200), "start_c": ("normal", 20, 5)}
+    oven, t = Simulator("temp_c", "degC", parameters, simulate=simulate, time="t_s"), 3.0 * np.arange(40)
+    noise = 0.1 * np.random.default_rng(4).standard_normal(40)
+    table = {"t_s": t, "temp_c": _warmed({"start_c": 20, "gain": 55}, 40.0, {"t_s": t}) + noise}
+    fit = fit_simulator(oven, table, rng=np.random.default_rng(1))
+    assert abs(fit.fitted.mode()["tau_s"] - 40.0) < 1.0
+    assert fit.rms < 0.12
+    assert diagnose_system(oven, table, rng=np.random.default_rng(1)).verdict == "clean"

@@ -22,7 +22,7 @@ from probewise._kinds import require_progress, require_rng
 from probewise._words import count_with_noun
 from probewise.diagnosis.diagnosis import Diagnosis, Thorough, diagnose_prepared
 from probewise.diagnosis.evidence import covariance_root, log_evidence_of
-from probewise.diagnosis.fit import AT_ONCE, FARTHEST, Fit, Model, fit, fit_each_start, with_prior
+from probewise.diagnosis.fit import AT_ONCE, DIFFERENCE, FARTHEST, Fit, Model, fit, fit_each_start, with_prior
 from probewise.diagnosis.noise import LEAST_SCALE, NoiseLaw, rough_sd, white_noise_of_recording
 from probewise.diagnosis.outlying import find_lost_readings, find_meter_stop
 from probewise.diagnosis.prepared import MOST_DIAGNOSED_READINGS, Prepared, positions_in_stretches
@@ -43,11 +43,13 @@ from probewise.systems import (
     progress_with_call_count,
     table_for,
 )
+from probewise.systems.calls import Caller
 from probewise.systems.forms import ReferenceFit, sorting_column
 from probewise.systems.forms.modulations import time_since_start_of_run
 from probewise.systems.forms.reference import note_on_row_order, rows_are_in_order
 from probewise.systems.system import STANDS_STILL, with_converged_step
 
+_COARSE = 0.1, 1e-2, 1e-3  # steps of a coordinate where smaller ones change nothing
 _STEPS_TRIED = 8  # from each start
 _BEST_STARTS = 3  # of which it goes on
 _BEGINNINGS = 0.25, 0.5  # shares of the longest run that are fitted before all of it
@@ -72,6 +74,8 @@ def fit_system(system: System, recording: Recording) -> tuple[System, Fit, float
     """
     table = cast(RunTable, recording.plan)
     law = white_noise_of_recording(recording)
+    if system.caller is not None:
+        system = replace(system, differences=_differences(system, table))
     found = _fit_from_best_starts(system, recording, law)
     sd = _noise_sd_of(system.simulator, table, recording, found)
 
@@ -86,6 +90,28 @@ def fit_system(system: System, recording: Recording) -> tuple[System, Fit, float
         system, found, sd = refitted(finer)
     finer = with_step_for_likely_parameters(system, table, found, sd)
     return (system, found, sd) if finer is system else refitted(finer)
+
+
+def _differences(system: System, table: RunTable) -> FloatArray:
+    """Return the step of each coordinate for differences, (n_params,).
+
+    It is small, but larger for a parameter that `simulate` rounds, counts by, or looks up: the least step that changes
+    predictions at most points of the prior where the largest one does.
+    """
+    chain, eye = replace(system, caller=replace(cast(Caller, system.caller))).chain(table, ()), np.eye(system.n_params)
+    about, out = chain.predict(system.theta(system.starts), table), np.full(system.n_params, DIFFERENCE)
+
+    def changed(step: float) -> BoolArray:
+        """Return at which points, of which coordinates: (n_params, n_points)."""
+        theta = system.theta((system.starts - step * eye[:, None]).reshape(-1, system.n_params))
+        change = chain.predict(theta, table).reshape(system.n_params, *about.shape) - about
+        return (np.isfinite(change) & (change != 0)).any(axis=2)
+
+    if not (changed(DIFFERENCE).mean(axis=1) > 0.5).all():
+        there = changed(_COARSE[0])
+        for step in (*_COARSE, DIFFERENCE):
+            out[2 * (changed(step) & there).sum(axis=1) >= there.sum(axis=1)] = step
+    return out
 
 
 def _fit_from_best_starts(system: System, recording: Recording, law: NoiseLaw) -> Fit:
@@ -212,6 +238,7 @@ class _Descent:
     def _look(self, x: FloatArray, *, central: bool) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Return residuals (k, n), slopes of the readings (k, n_params, n), variances and heights, (k,), at points."""
         steps = np.where(x > 0.5 * (self.low + self.high), -_DIFFERENCE, _DIFFERENCE) * (10.0 if central else 1.0)
+        steps = steps * np.asarray(self.system.differences) / DIFFERENCE
         apart = steps[:, :, None] * np.eye(x.shape[1])
         sides = [x[:, None], x[:, None] + apart, *([x[:, None] - apart] if central else [])]
         ends = [1, 1 + x.shape[1]][: len(sides) - 1]

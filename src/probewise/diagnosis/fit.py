@@ -147,15 +147,6 @@ _VALLEY_DAMPINGS = np.array([1.0, 3.0, 10.0, 30.0, 100.0])  # times the curvatur
 _DAMPINGS = np.array([0.0, 0.05, 0.7, 10.0, 200.0])
 
 
-def difference_points_and_steps(z: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return points z and, one small step along each coordinate, others, (..., n_params + 1, n_params), and the steps.
-
-    The steps, (..., n_params) as z, point inwards, to stay within the bounds.
-    """
-    steps, n_params = np.where(z > 0, -DIFFERENCE, DIFFERENCE), z.shape[-1]
-    return z[..., None, :] + steps[..., None, :] * np.eye(n_params + 1, n_params, -1), steps
-
-
 def _prediction_and_slopes(batch: FloatArray, steps: FloatArray) -> tuple[FloatArray, FloatArray]:
     with np.errstate(invalid="ignore", over="ignore"):  # at a start from which the model diverges, which is not taken
         return batch[0], (batch[1:] - batch[0]).T / steps
@@ -195,6 +186,16 @@ class Model:
             out[self.coordinate_slice(effect.name)] = isinstance(effect.prior, SharedScalePrior)
         return out
 
+    def difference_points_and_steps(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return points z and, one small step along each coordinate, others, (..., n_params + 1, n_params), and steps.
+
+        The steps, (..., n_params) as z, point inwards, to stay within the bounds.
+        """
+        size = np.full(self.n_params, DIFFERENCE)
+        size[: self.sensor.n_params] = getattr(self.sensor, "differences", DIFFERENCE)
+        steps = np.where(z > 0, -size, size)
+        return z[..., None, :] + steps[..., None, :] * np.eye(self.n_params + 1, self.n_params, -1), steps
+
     def coordinate_slice(self, name: str) -> slice:
         """Return the slice of one effect's coordinates."""
         return {effect.name: own for effect, own in effects_with_columns(self.effects, self.sensor.n_params)}[name]
@@ -223,7 +224,7 @@ class Model:
 
     def predict_and_differentiate(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return predictions, (n_points,), and their slopes, (n_points, n_params), at one point z (n_params,)."""
-        points, steps = difference_points_and_steps(z)
+        points, steps = self.difference_points_and_steps(z)
         return _prediction_and_slopes(self.predict(points), steps)
 
     def with_effect(self, effect: Effect) -> Model:
@@ -353,7 +354,7 @@ def _fit_coroutine(
             return np.asarray(law.minus_log_likelihood(whitened, sigma) + 0.5 * np.sum(z**2, axis=1))
 
     def request_slopes(z: FloatArray) -> Generator[FloatArray, FloatArray, tuple[FloatArray, FloatArray]]:
-        points, steps = difference_points_and_steps(z)
+        points, steps = model.difference_points_and_steps(z)
         return _prediction_and_slopes((yield points), steps)
 
     z = np.clip(np.asarray(start, dtype=np.float64), -FARTHEST, FARTHEST)
@@ -382,7 +383,9 @@ def _fit_coroutine(
         tries = _points_after_steps(z, tries)
         # If predictions broadcast, slopes are computed along with them, unless they cost little near the best of them.
         in_bulk = model.sensor.predicts_in_bulk
-        about, steps = difference_points_and_steps(tries) if in_bulk and not dear else (tries[:0], tries[:0])
+        about, steps = tries[:0], tries[:0]
+        if in_bulk and not dear:
+            about, steps = model.difference_points_and_steps(tries)
         batch = yield np.concatenate(about) if len(about) else tries[: 1 if dear else None]
         if dear and not best - objective(batch, tries[:1])[0] > _AS_EXPECTED * expected:
             if not exact:

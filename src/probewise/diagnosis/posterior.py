@@ -35,7 +35,7 @@ from scipy.special import logsumexp, ndtr, ndtri
 
 from probewise._arrays import LAST_DIGITS, BoolArray, FloatArray, IntArray
 from probewise.diagnosis.evidence import NUMBERS, NoiseEvidence, log_evidence_of
-from probewise.diagnosis.fit import FARTHEST, Fit, Model, difference_points_and_steps, fit, fit_each_start, with_prior
+from probewise.diagnosis.fit import FARTHEST, Fit, Model, fit, fit_each_start, with_prior
 from probewise.diagnosis.noise import LEAST_SCALE, RUNS_AWAY, NoiseLaw, SdPrior
 from probewise.diagnosis.sensors import CalibratedSensor
 from probewise.effects import Effect, HeavyTailedPrior
@@ -182,7 +182,7 @@ class TangentModel:
         upstream = np.ones(self.n_params, dtype=np.bool_)
         for effect in filter(acts_on_readings, self.model.effects):
             upstream[self.model.coordinate_slice(effect.name)] = False
-        points, steps = difference_points_and_steps(found.z)
+        points, steps = found.model.difference_points_and_steps(found.z)
         views = self.model.chain.simulated_view(self.model.theta(points[np.append(True, upstream)]), self.model.plan)
         self.view, self.is_finite = views[0], bool(np.isfinite(views).all())
         self.slopes = np.zeros((self.n_params, views.shape[1]))  # 0 for coordinates of effects on the readings
@@ -481,7 +481,7 @@ class _Ridge:
 
     def _linearise(self, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
         """Return slopes (k, n_params, n), residuals (k, n), both in noise sds, precisions, and which are possible."""
-        usable, (points, steps) = self.problem.recording.usable, difference_points_and_steps(z)
+        usable, (points, steps) = self.problem.recording.usable, self.problem.model.difference_points_and_steps(z)
         predicted = self.problem.predict_usable(points.reshape(-1, z.shape[1]))
         with np.errstate(all="ignore"):
             left = self.law((self.problem.recording.readings[usable] - predicted).T).T

@@ -64,6 +64,8 @@ class System:
     slack
         Distance within the range, in the unit of the readings, from which noise may carry a reading to an end. For a
         reading at an end, a prediction within this distance counts as beyond the end.
+    differences
+        Step of each standard-normal coordinate for differences, (n_params,), or of all.
     parts
         Parts of tables, by table and rows, and what predicts these rows alone (`part_that_predicts`).
     """
@@ -77,6 +79,7 @@ class System:
     integrations: Integrations = field(default_factory=Integrations)
     limited: bool = True
     slack: float = 0.0
+    differences: float | FloatArray = 1e-5
     parts: dict[Any, Any] = field(default_factory=dict, repr=False)
 
     # It has no SSF, and effects are screened about its fit.

@@ -160,7 +160,7 @@ def checked_text(name: str, value: object, allowed: str = "a text") -> str:
     raise ParameterError(name, value, allowed)
 
 
-def require_plain_text(name: str, value: object, allowed: str = "a text") -> None:
+def require_text(name: str, value: object, allowed: str = "a text") -> None:
     """Raise ParameterError unless `value` is a text, which may be empty, without control characters."""
     require(isinstance(value, str) and not _CONTROL.search(value), name, value, f"{allowed}, no control characters")
 
@@ -184,4 +184,4 @@ def require_mapping(name: str, value: object, allowed: str) -> None:
     require_kind(name, value, Mapping, allowed)
     assert isinstance(value, Mapping)
     for each in value:
-        require_plain_text(f"a name in {name}", checked_text(f"a name in {name}", each))
+        require_text(f"a name in {name}", checked_text(f"a name in {name}", each))

@@ -34,16 +34,8 @@ from probewise.errors import ParameterError, ProbewiseError
 from probewise.priors import LogUniform, Normal, Uniform
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Plan, Recording, masks_of_readings_at_ends
-from probewise.systems import (
-    RunRecording,
-    RunTable,
-    Simulator,
-    System,
-    as_recording,
-    progress_with_call_count,
-    table_for,
-)
-from probewise.systems.calls import Caller
+from probewise.systems import RunRecording, RunTable, Simulator, System, as_recording, table_for
+from probewise.systems.calls import Caller, progress_with_call_count
 from probewise.systems.forms import ReferenceFit, sorting_column
 from probewise.systems.forms.modulations import time_since_start_of_run
 from probewise.systems.forms.reference import note_on_row_order, rows_are_in_order
@@ -105,7 +97,7 @@ def _differences(system: System, table: RunTable) -> FloatArray:
         """Return at which points, of which coordinates: (n_params, n_points)."""
         theta = system.theta((system.starts - step * eye[:, None]).reshape(-1, system.n_params))
         change = chain.predict(theta, table).reshape(system.n_params, *about.shape) - about
-        return (np.isfinite(change) & (change != 0)).any(axis=2)
+        return np.asarray((np.isfinite(change) & (change != 0)).any(axis=2))
 
     if not (changed(DIFFERENCE).mean(axis=1) > 0.5).all():
         there = changed(_COARSE[0])
@@ -502,17 +494,6 @@ def notes_on_prior_conflict(system: System, found: Fit, law: NoiseLaw) -> Iterat
             yield f"the readings ask for {name} {abs(at + step):.1f} sds {way} the mean of its prior, {prior}"
 
 
-def notes_on_declared_noise(simulator: Simulator, noise_sd: FloatArray) -> Iterator[str]:
-    """Yield a note if samples of the noise sd, (n_samples,), contradict the number that was declared."""
-    declared = simulator.noise.sd
-    if declared is None or isinstance(declared, str):
-        return
-    mean, sd = float(np.mean(noise_sd)), float(np.std(noise_sd))
-    if abs(mean - declared) > max(_FAR * sd, (_MUCH - 1) * declared):
-        unit = f" {simulator.unit}" if simulator.unit else ""
-        yield f"the noise sd of a reading is {mean:.3g} ± {sd:.1g}{unit}, though {declared:g} was declared"
-
-
 @own_arithmetic
 def diagnose_system(
     simulator: Simulator,
@@ -636,14 +617,22 @@ def notes_on_calls(diagnosis: Diagnosis) -> tuple[str, ...]:
     apparatus = diagnosis.apparatus
     if not isinstance(apparatus, SimulatorApparatus):
         return ()
-    white = diagnosis.noise.model == "white"
-    declared = notes_on_declared_noise(apparatus.system.simulator, diagnosis.repaired.noise_sd) if white else ()
-    return (*declared, *notes_on_predictions(apparatus))
+    noise_sd = diagnosis.repaired.noise_sd if diagnosis.noise.model == "white" else None
+    return tuple(notes_on_simulator(apparatus, noise_sd))
 
 
-def notes_on_predictions(apparatus: SimulatorApparatus) -> Iterator[str]:
-    """Yield notes on what was not predicted, or not exactly, by the simulator's function or its law."""
-    caller, done, law = apparatus.system.caller, apparatus.system.integrations, apparatus.system.simulator.law
+def notes_on_simulator(apparatus: SimulatorApparatus, noise_sd: FloatArray | None) -> Iterator[str]:
+    """Yield notes on what its function or law did not predict, or not exactly, and on a noise sd that it declares.
+
+    `noise_sd`: samples of it, (n_samples,), or None.
+    """
+    system, declared = apparatus.system, apparatus.system.simulator.noise.sd
+    caller, done, law = system.caller, system.integrations, system.simulator.law
+    if noise_sd is not None and declared is not None and not isinstance(declared, str):
+        mean, sd, unit = float(np.mean(noise_sd)), float(np.std(noise_sd)), system.simulator.unit
+        if abs(mean - declared) > max(_FAR * sd, (_MUCH - 1) * declared):
+            found = f"{mean:.3g} ± {sd:.1g} {unit}".rstrip()
+            yield f"the noise sd of a reading is {found}, though {declared:g} was declared"
     if caller is not None and caller.cut_short:
         yield (
             f"simulate takes one sample at a time: after {CALLS_OF_A_SEARCH:,} calls some promising combinations of "

@@ -13,12 +13,7 @@ from probewise import nested
 from probewise._arrays import FloatArray, own_arithmetic
 from probewise._display import Reported
 from probewise._kinds import require_flag, require_kind, require_progress, require_rng
-from probewise.diagnosis.diagnose_simulator import (
-    modes_of,
-    notes_on_declared_noise,
-    notes_on_predictions,
-    prepare_system,
-)
+from probewise.diagnosis.diagnose_simulator import modes_of, notes_on_simulator, prepare_system
 from probewise.diagnosis.diagnosis import Diagnosis
 from probewise.diagnosis.evidence import NUMBERS, laplace_evidence, log_evidence_of
 from probewise.diagnosis.fit import Fit, Model, fit_each_start
@@ -231,8 +226,7 @@ def fit_simulator(
     else:
         noise_sd = draw_noise_sd(likeliest, recording.readings[usable] - predicted[:, usable], rng=rng)
     samples = ModelSamples(system.chain(recording.plan, ()), system.theta(z), noise_sd, 0)
-    said = [*note_on_improbable_rows(fits[0], recording), *notes_on_declared_noise(simulator, noise_sd)]
-    said += notes_on_predictions(apparatus)
+    said = [*note_on_improbable_rows(fits[0], recording), *notes_on_simulator(apparatus, noise_sd)]
     said += _doubts(problem, draws, modes[0], n_even, is_settled=is_settled)
     recording = replace(recording, notes=(*recording.notes, *said))
     mean = predicted.mean(axis=0)

@@ -251,19 +251,14 @@ def run_python_text(text: str, path: Path) -> Mapping[str, Any]:
 @contextlib.contextmanager
 def in_this_directory() -> Iterator[None]:
     """Return to the working directory, from which relative names count, if code of a user leaves it in the block."""
-    before = _working_directory()
+    before = "."
+    with contextlib.suppress(OSError):  # it was removed
+        before = os.getcwd()
     try:
         yield
     finally:
-        if before and _working_directory() != before:
+        with contextlib.suppress(OSError):
             os.chdir(before)
-
-
-def _working_directory() -> str:
-    try:
-        return os.getcwd()
-    except OSError:  # it was removed
-        return ""
 
 
 class EndedByFile(Exception):

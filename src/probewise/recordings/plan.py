@@ -22,13 +22,7 @@ from probewise._arrays import (
     rounding_error,
 )
 from probewise._display import ShowsItself
-from probewise._kinds import (
-    checked_finite_number,
-    checked_whole,
-    require_kind,
-    require_plain_text,
-    warn_of_likely_degrees,
-)
+from probewise._kinds import checked_finite_number, checked_whole, require_kind, require_text, warn_of_likely_degrees
 from probewise._words import unit_after_number
 from probewise.errors import ParameterError, ShapeError, require
 from probewise.recordings.cells import times_to_numbers
@@ -72,7 +66,7 @@ class Instrumentation:
 
     def __post_init__(self) -> None:
         for name in ("unit", "sensor"):
-            require_plain_text(name, getattr(self, name))
+            require_text(name, getattr(self, name))
         require_kind("description", self.description, str, "a text")
         for name in ("min", "max", "step", "height_mm"):
             if getattr(self, name) is not None:

@@ -1,6 +1,5 @@
 """A user's simulator over a table of readings, and the chain of effects that it may leave out."""
 
-from probewise.systems.calls import progress_with_call_count
 from probewise.systems.fitted import FittedSystem, read_fitted_system, samples_csv, write_fitted_system
 from probewise.systems.prediction import SystemPrediction, as_recording, predict_system, write_system_prediction
 from probewise.systems.simulator import Extra, Law, Noise, Simulator, read_simulator, read_table_for, table_for
@@ -21,7 +20,6 @@ __all__ = [
     "as_recording",
     "concatenate_tables",
     "predict_system",
-    "progress_with_call_count",
     "read_fitted_system",
     "read_run_table",
     "read_simulator",

@@ -23,7 +23,7 @@ from probewise._kinds import (
     require_kind,
     require_mapping,
     require_one_of,
-    require_plain_text,
+    require_text,
 )
 from probewise.effects import EFFECTS, RARE_EFFECTS
 from probewise.errors import FileError, ParameterError, message_of, printable, require, shown
@@ -195,7 +195,7 @@ class Simulator:
         allowed = f"one of them: {from_python}; in a file {in_a_file}"
         require((self.simulate is None) != (self.law is None), "simulate, rates", found, allowed)
         checked_text("reading", self.reading, 'the name of the column that is predicted: reading = "..."')
-        require_plain_text("unit", self.unit, 'a text: unit = "..."')
+        require_text("unit", self.unit, 'a text: unit = "..."')
         require_flag("vectorized", self.vectorized)
         checked_text("time_unit", self.time_unit, 'a text, such as "min"')
         known = {self.reading: "the reading"}

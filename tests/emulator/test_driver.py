@@ -34,7 +34,6 @@ def some_places(n):
     rng = np.random.default_rng(SEED)
     geometry = arm.read_geometry(arm.shipped_geometry_path())
     places = np.stack([rng.uniform(100, 950, 20 * n), rng.uniform(50, 480, 20 * n)], axis=1)
-    from_edge = np.hypot(places[:, 0] - 600, places[:, 1] - 250) - 80
     # Half of them over the circle, which is small.
     places[: 10 * n] = [600, 250] + (places[: 10 * n] - [525, 265]) / 12
     from_edge = np.hypot(places[:, 0] - 600, places[:, 1] - 250) - 80

@@ -18,7 +18,9 @@ def test_the_paper_plan_is_the_papers():
     np.testing.assert_array_equal(plan.x_mm[rows[2]], np.arange(-50, 51))
     np.testing.assert_allclose(plan.orientation_rad[[r[0] for r in rows]], np.radians([0, 90, 180, 270, 0]))
     assert [plan.pattern_names[k] for k in plan.pattern[rows[4]]] == [f"quadrant_{c}" for c in "abcd"]
-    assert [plan.patterns[f"quadrant_{c}"].corner_mm for c in "abcd"] == [(0, 0), (0, 0), (4, 4), (-4, 4)]
+    quadrants = [plan.patterns[f"quadrant_{c}"] for c in "abcd"]
+    assert [quadrant.corner_mm for quadrant in quadrants] == [(0, 0), (0, 0), (4, 4), (-4, 4)]
+    assert [quadrant.direction for quadrant in quadrants] == [(1, 1), (-1, 1), (1, 1), (-1, 1)]
     np.testing.assert_array_equal(plan.direction_of_motion[rows[0]], np.tile([1.0, 0.0], (101, 1)))
     np.testing.assert_array_equal(plan.direction_of_motion[rows[4]], 0)
     np.testing.assert_allclose(np.diff(plan.time_s[rows[0]]), 1.2)

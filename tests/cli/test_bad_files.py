@@ -48,12 +48,6 @@ def test_a_sensor_that_is_no_sensor_is_refused(what, refused, recording_file, tm
 
 
 @pytest.mark.parametrize("what", SOME_TEXTS)
-def test_a_description_that_is_none_is_refused(what, refused, recording_file, tmp_path):
-    recording_file.with_suffix(".json").write_bytes(TEXTS[what])
-    assert "small.json" in refused("audit", recording_file)
-
-
-@pytest.mark.parametrize("what", SOME_TEXTS)
 @pytest.mark.parametrize("first", [b"", b'{"format": "journal/1"}\n'])
 def test_a_journal_that_is_none_is_refused(what, first, refused, sensor_file, tmp_path):
     (tmp_path / "bad.jsonl").write_bytes(first + TEXTS[what] + b"\n")

@@ -21,6 +21,7 @@ from probewise.scene import (
 def test_the_inner_pentagon_of_a_star_is_outside_by_the_even_odd_rule():
     star = region_of(kinds.Polygon(((0.0, 20.0), (12.0, -16.0), (-19.0, 6.0), (19.0, 6.0), (-12.0, -16.0))))
     assert star.albedo(np.array([[0.0, 0.0], [0.0, 17.0]])).tolist() == [[0.0, 1.0]]
+    assert star.edges_mm.shape == (1, 15, 2, 2)  # five triangles
 
 
 def test_a_polygon_of_many_vertices_is_taken_apart_at_once():

@@ -285,33 +285,23 @@ class _MixtureAboutPeaks:
         return y[inside], theta[inside], self.log_density(y[inside]) - log_prior[inside]
 
 
-def distinct_peaks(problem: SensorProblem, peaks: FloatArray) -> FloatArray:
-    """Leave out peaks near an earlier one under any labels, (n_peaks, 6 N + 2), and all but the first six distinct."""
-    assert isinstance(problem.prior, SSFPrior)
-    space = LightContrasts(problem.prior)
-    kept: list[FloatArray] = []
-    densities: list[StudentTDensity] = []
-    for peak in peaks:
-        labelled = space.relabelled(space.enter(peak[None]))
-        distance = min((density.square_distance(labelled).min() for density in densities), default=math.inf)
-        if len(kept) < _MOST_PEAKS and distance > _SAME * labelled.shape[-1]:
-            densities.append(laplace(problem, space, peak))
-            kept.append(peak)
-    return np.array(kept)
-
-
 def weigh_draws_about_peaks(
     problem: SensorProblem, peaks: FloatArray, *, rng: np.random.Generator
 ) -> tuple[Weighted, Callable[[FloatArray], FloatArray]]:
-    """Estimate evidence and posterior from draws about distinct peaks, (n_peaks, 6 N + 2).
+    """Estimate evidence and posterior from draws about peaks, (n_peaks, 6 N + 2): the first six distinct ones.
 
-    `problem`: with an `SSFPrior` of uniform light. Also return the log weight as a function of parameters: of prior
-    times likelihood over the density of the draws.
+    A peak near an earlier one under any labels is none of its own. `problem`: with an `SSFPrior` of uniform light. Also
+    return the log weight as a function of parameters: of prior times likelihood over the density of the draws.
     """
     assert isinstance(problem.prior, SSFPrior)
-    space, densities, log_z, n_calls = LightContrasts(problem.prior), [], [], 0
+    space, densities, log_z, n_calls = LightContrasts(problem.prior), list[StudentTDensity](), list[float](), 0
     for peak in peaks:
-        density, own = laplace(problem, space, peak), -math.inf
+        labelled = space.relabelled(space.enter(peak[None]))
+        distance = min((density.square_distance(labelled).min() for density in densities), default=math.inf)
+        if len(densities) < _MOST_PEAKS and distance > _SAME * labelled.shape[-1]:
+            densities.append(laplace(problem, space, peak))
+    for k, density in enumerate(densities):
+        own = -math.inf
         for _ in range(_N_ROUNDS):
             y, theta, log_density = _MixtureAboutPeaks(space, [density], np.ones(1)).draw(_N_PILOTS, rng)
             if len(y) < 2 * y.shape[1]:
@@ -321,10 +311,10 @@ def weigh_draws_about_peaks(
             n_calls += len(y)
             own = float(logsumexp(log_weight)) - math.log(_N_PILOTS)
             density = density.refitted(y, log_weight)
-        densities.append(density)
+        densities[k] = density
         log_z.append(own)
     by_evidence = np.exp(np.array(log_z) - logsumexp(log_z)) if max(log_z) > -math.inf else np.ones(1)
-    share = _BY_EVIDENCE * by_evidence + (1.0 - _BY_EVIDENCE) / len(peaks)
+    share = _BY_EVIDENCE * by_evidence + (1.0 - _BY_EVIDENCE) / len(densities)
     mixture = _MixtureAboutPeaks(space, densities, share / share.sum())
     _, theta, log_density = mixture.draw(_N_DRAWS, rng)
     log_likelihood = problem.log_likelihood(theta)

@@ -26,7 +26,6 @@ from probewise.calibration.peaks import (
     MOST_RELABELLED,
     StudentTDensity,
     climb,
-    distinct_peaks,
     laplace,
     starts_of_climbs,
     weigh_draws_about_peaks,
@@ -184,7 +183,7 @@ def fit_orders_quickly(
         if n not in orders:
             continue
         best = max((each.evidence_result.log_z for each in found.values()), default=-math.inf)
-        made, weigh = weigh_draws_about_peaks(problem, distinct_peaks(problem, peaks), rng=rng)
+        made, weigh = weigh_draws_about_peaks(problem, peaks, rng=rng)
         gains = made.log_z > best + _GAINED
         if gains and (n > MOST_RELABELLED or not made.sound or made.n_eff <= _LEAST_EFFECTIVE):
             found[n] = search(n, rng)

@@ -34,7 +34,7 @@ from probewise.calibration.priors import SSFPrior
 from probewise.errors import DoubtfulResultWarning
 from probewise.inference import SensorProblem
 from probewise.nested import NestedResult, Samplable, Weighted, least_live, run
-from probewise.nested.importance import Repartitioned
+from probewise.nested.importance import Repartitioned, samples_of_run
 from probewise.priors import Uniform
 
 # With fewer the posterior may lie along the bounds of the prior, far from any peak; and a search costs little.
@@ -122,21 +122,8 @@ def _sample_near_peaks(
     place = StudentTDensity(centres.mean(axis=0), np.asarray(np.linalg.cholesky(covariance)))
     near = Repartitioned(problem, _NearPosterior(prior, place))
     found = _run_silently(near, max(_N_LIVE, least_live(len(prior.names))), rng, progress)
-    rows = np.flatnonzero(found.log_weight > -math.inf)
-    theta = found.theta[rows]
-    made = Weighted(
-        found.names,
-        theta,
-        log_likelihood=found.log_likelihood[rows] - near.prior.log_prior_ratio(theta),
-        log_weight=found.log_weight[rows],
-        log_z=found.log_z,
-        log_z_error=found.log_z_error,
-        n_eff=found.n_eff,
-        n_calls=found.n_calls,
-        pareto_k=-math.inf,
-        warnings=found.warnings,
-    )
-    return made, near.log_likelihood
+    log_likelihood = found.log_likelihood - near.prior.log_prior_ratio(found.theta)
+    return replace(samples_of_run(found), log_likelihood=log_likelihood, run=None), near.log_likelihood
 
 
 def _run_silently(problem: Samplable, n_live: int, rng: np.random.Generator, progress: Progress | None) -> NestedResult:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -99,6 +99,12 @@ def evenly_weighted(
     """Return equally weighted samples, theta (n, n_params) and log_likelihood (n,), and an evidence, by default one."""
     even, n = np.full(len(theta), -math.log(len(theta))), float(len(theta))
     return Weighted(names, theta, log_likelihood, even, log_z, log_z_error, n, n_calls, pareto_k=-math.inf, run=run)
+
+
+def samples_of_run(run: NestedResult) -> Weighted:
+    """Return the samples, the evidence and the warnings of a run, with the run."""
+    same = {each.name: getattr(run, each.name) for each in fields(Samples)}
+    return Weighted(**same, pareto_k=-math.inf, run=run, warnings=run.warnings)
 
 
 def weighted_draws(
@@ -413,11 +419,8 @@ def update(
         if found.sound:
             return replace(found, n_calls=found.n_calls + evaluate.n_calls)
         k = found.pareto_k
-    fallen = fall_back()
-    samples = fallen.names, fallen.theta, fallen.log_likelihood, fallen.log_weight
-    evidence = fallen.log_z, fallen.log_z_error, fallen.n_eff
-    n_calls = evaluate.n_calls + fallen.n_calls
-    return Weighted(*samples, *evidence, n_calls, k, run=fallen, warnings=fallen.warnings)
+    fallen = samples_of_run(fall_back())
+    return replace(fallen, n_calls=evaluate.n_calls + fallen.n_calls, pareto_k=k)
 
 
 def _evaluator_and_space(problem: Samplable, found: Posterior, name: str) -> tuple[Evaluator, Space]:

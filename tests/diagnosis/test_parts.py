@@ -12,7 +12,6 @@ from scipy.integrate import quad
 
 from probewise.arm import readings_of_recording, recording_of_readings
 from probewise.diagnosis import templates as templates_module
-from probewise.diagnosis.advice import Alias
 from probewise.diagnosis.evidence import LEAST_VISIBLE, SCALES, Linearised
 from probewise.diagnosis.fit import Fit, Model, effect_coordinates, effect_values
 from probewise.diagnosis.light_sensor import LightSensorApparatus, rows_as_next_scan
@@ -28,7 +27,6 @@ from probewise.diagnosis.templates import (
     log_bayes_factors_of_pairs,
     templates_of_effect,
 )
-from probewise.diagnosis.verdict import Hypothesis, Judged, verdict_and_combination
 from probewise.effects import VOCABULARY, Extent
 from probewise.effects.effect import Where
 from probewise.effects.reference import candidate_scan_groups
@@ -456,40 +454,3 @@ def test_a_flat_surface_read_alike_from_another_angle_or_in_the_dark_is_another_
 def test_recordings_of_other_units_are_not_joined():
     with pytest.raises(ParameterError, match="volt"):
         join([line(), line(unit="volt")])
-
-
-NOISE = frozenset({"correlated_noise"})
-
-
-def hypotheses(**probability: float) -> tuple[Hypothesis, ...]:
-    names = {"clean": ()}
-    found = [Hypothesis(names.get(k, tuple(k.split("__"))), p) for k, p in probability.items()]
-    return tuple(sorted(found, key=lambda h: -h.probability))
-
-
-@pytest.mark.parametrize(
-    ("probability", "verdict", "combination"),
-    [
-        ({"clean": 0.6, "lag": 0.4}, "clean", ()),
-        ({"clean": 0.2, "unknown": 0.6, "lag": 0.2}, "unknown", ("unknown",)),
-        ({"clean": 0.2, "backlash": 0.8}, "named", ("backlash",)),
-        ({"clean": 0.2, "backlash": 0.4, "lag": 0.4}, "cannot_tell", ("backlash",)),
-        ({"clean": 0.1, "backlash": 0.4, "glint": 0.3, "lag": 0.2}, "cannot_tell", ("backlash",)),
-        ({"clean": 0.1, "backlash": 0.4, "tilt": 0.2, "glint": 0.3}, "cannot_tell", ("backlash",)),
-        ({"clean": 0.1, "correlated_noise": 0.9}, "noise", ("correlated_noise",)),
-        ({"clean": 0.1, "backlash__correlated_noise": 0.9}, "named", ("backlash", "correlated_noise")),
-        ({"clean": 0.45, "glint": 0.3, "lag": 0.25}, "cannot_tell", ()),
-        ({"clean": 0.3, "glint": 0.4, "lag": 0.3}, "cannot_tell", ("glint",)),
-    ],
-)
-def test_verdicts_follow_the_probabilities(probability, verdict, combination):
-    aliases = (Alias(("backlash", "tilt"), 1.0, "turn the sensor", 8), Alias(("backlash", "lag"), 0.99, "go back", 8))
-    found = verdict_and_combination(
-        hypotheses(**probability), 0.0, noise_names=NOISE, aliases=aliases, aliased_with=lambda _: frozenset()
-    )
-    assert found == (verdict, combination)
-
-
-def test_a_credible_set_is_the_fewest_that_hold_the_mass():
-    found = hypotheses(clean=0.02, backlash=0.7, backlash__lag=0.26, glint=0.02)
-    assert Judged("named", ("backlash",), 0.0, found).credible == ("backlash", "backlash+lag")

@@ -119,12 +119,36 @@ def test_a_rival_that_the_readings_cannot_tell_from_the_leader_keeps_it_from_bei
     assert verdict({(("lag",), ()): 0.9, (("backlash",), ()): 0.1}, same=[("backlash",)]) == ("named", ("lag",))
 
 
-def test_nothing_is_named_below_one_half():
-    """Whatever noise is beside it counts."""
-    three = {(("lag",), ()): 0.4, (("drift",), ()): 0.3, (("glint",), ()): 0.3}
-    assert verdict(three) == ("cannot_tell", ("lag",))
-    noisy = {(("lag",), ()): 0.4, (("lag",), ("outliers",)): 0.2, (("glint",), ()): 0.4}
-    assert verdict(noisy) == ("named", ("lag",))
+def of_words(probability):
+    """Probabilities by effects on mean and noise, from those by names in a row; none is clean."""
+    parts = {tuple(names.split()): p for names, p in probability.items()}
+    return {(tuple(n for n in k if n not in NOISE), tuple(n for n in k if n in NOISE)): p for k, p in parts.items()}
+
+
+@pytest.mark.parametrize(
+    ("probability", "said", "combination"),
+    [
+        ({"": 0.6, "lag": 0.4}, "clean", ()),
+        ({"": 0.2, "unknown": 0.6, "lag": 0.2}, "unknown", ("unknown",)),
+        ({"": 0.2, "backlash": 0.8}, "named", ("backlash",)),
+        ({"": 0.2, "backlash": 0.4, "lag": 0.4}, "cannot_tell", ("backlash",)),
+        ({"": 0.1, "backlash": 0.4, "glint": 0.3, "lag": 0.2}, "cannot_tell", ("backlash",)),
+        ({"": 0.1, "backlash": 0.4, "tilt": 0.2, "glint": 0.3}, "cannot_tell", ("backlash",)),
+        ({"": 0.1, "outliers": 0.9}, "noise", ("outliers",)),
+        ({"": 0.1, "backlash outliers": 0.9}, "named", ("backlash", "outliers")),
+        ({"": 0.45, "glint": 0.3, "lag": 0.25}, "cannot_tell", ()),
+        ({"": 0.3, "glint": 0.4, "lag": 0.3}, "cannot_tell", ("glint",)),  # nothing is named below one half,
+        ({"glint": 0.4, "glint outliers": 0.2, "lag": 0.4}, "named", ("glint",)),  # whatever noise is beside it
+    ],
+)
+def test_verdicts_follow_the_probabilities(probability, said, combination):
+    aliases = (Alias(("backlash", "tilt"), 1.0, "turn the sensor", 8), Alias(("backlash", "lag"), 0.99, "go back", 8))
+    assert verdict(of_words(probability), aliases=aliases) == (said, combination)
+
+
+def test_a_credible_set_is_the_fewest_that_hold_the_mass():
+    found = ranked_hypotheses(of_words({"": 0.02, "backlash": 0.7, "backlash lag": 0.26, "glint": 0.02}), lambda m: m)
+    assert Judged("named", ("backlash",), 0.0, found).credible == ("backlash", "backlash+lag")
 
 
 def test_the_leader_is_the_effect_on_the_mean_with_the_most_probability_over_all_noises():

@@ -12,11 +12,10 @@ import numpy as np
 import pytest
 from hand_made import hand_made_sensor
 from PIL import Image
+from small_search import arm_and_experiment
 
-from probewise.arm import SimulatedArm
 from probewise.calibration import predict
 from probewise.experiment import (
-    Experiment,
     Exploration,
     estimated_shape,
     explore,
@@ -24,14 +23,11 @@ from probewise.experiment import (
     result_json,
     samples_csv,
 )
-from probewise.inference import GaussianKnown
-from probewise.recordings import Disc, read_recording, shipped
+from probewise.recordings import read_recording, shipped
 from probewise.report import calibration as calibration_report
 from probewise.report import exploration
 from probewise.report.plots.canvas import axes_of_frame
-from probewise.scene import Circle, HypothesisScene, outlines
-from probewise.sensor import Chain, FixedLevels, FixedMixture
-from probewise.world import Blob, World, gaussian_spot
+from probewise.scene import outlines
 
 TRUTH = np.array([[600.0, 260.0, 120.0]])
 COLOURS = {
@@ -48,13 +44,7 @@ COLOURS = {
 
 def searched(n_readings):
     rng = np.random.default_rng(4)
-    world = World(gaussian_spot([Blob(1.0, (0.0, 1.5), (4.0, 2.5))]))
-    hidden = Disc((600.0, 260.0), 120.0)
-    circle = Circle(radius_mm=(50.0, 150.0), inside=True)
-    mixture = FixedMixture([1.0], [[0.0, 1.5]], [[[16.0, 0.0], [0.0, 6.25]]])
-    model = Chain(mixture, FixedLevels(10.0, 60.0), HypothesisScene(circle))
-    experiment = Experiment(circle, model, GaussianKnown(0.7), 0.7, n_live=40, n_particles=300)
-    arm = SimulatedArm(lambda at, time_s, height_mm: world.read(hidden, at.x_mm, at.y_mm, time_s=time_s, rng=rng))
+    arm, experiment = arm_and_experiment(tuple(TRUTH[0]), rng)
     with arm:
         return Exploration(experiment, tuple(explore(arm, experiment, rng=rng, max_readings=n_readings)))
 

@@ -25,10 +25,18 @@ def test_a_letter_that_is_the_whole_name_of_a_column_is_no_unit(name):
     assert words_and_unit(name) == (name.replace("_", " "), "")
 
 
-def test_the_last_part_of_a_columns_name_is_its_unit_and_the_rest_its_name():
-    assert words_and_unit("room_c") == ("room", "°C")
-    assert words_and_unit("battery_mv") == ("battery", "mV")
-    assert words_and_unit("time") == ("time", "s")
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("room_c", ("room", "°C")),
+        ("battery_mv", ("battery", "mV")),
+        ("time", ("time", "s")),
+        ("level", ("predicted reading", "counts")),
+        ("place", ("place along the scans", "mm")),
+    ],
+)
+def test_the_last_part_of_a_columns_name_is_its_unit_and_the_rest_its_name(name, said):
+    assert words_and_unit(name) == said
 
 
 @pytest.mark.parametrize(

@@ -8,37 +8,25 @@ import numpy as np
 import pytest
 from hand_made import hand_made_sensor
 from PIL import Image
+from small_search import arm_and_experiment
 
 import probewise
-from probewise.arm import Pose, SimulatedArm
+from probewise.arm import Pose
 from probewise.cli import main
 from probewise.cli.demo import diagnose_shipped_recording
 from probewise.errors import ParameterError
-from probewise.experiment import Experiment, HiddenShape, run_from_place
-from probewise.inference import GaussianKnown
-from probewise.inquiry import Grid, ReadingEntropy
-from probewise.recordings import Disc, read_recording, shipped
+from probewise.experiment import HiddenShape, run_from_place
+from probewise.recordings import read_recording, shipped
 from probewise.report.demo import doubt_section, doubt_sentence, draw_views, largest_error_mm
 from probewise.report.plots import PAGE_IN, png
-from probewise.scene import Circle, HypothesisScene
-from probewise.sensor import Chain, FixedLevels, FixedMixture
-from probewise.world import Blob, World, gaussian_spot
 
 FIRST = Pose(590.0, 250.0)
 
 
 def searched(max_readings):
-    world = World(gaussian_spot([Blob(1.0, (0.0, 1.5), (4.0, 2.5))]))
-    rng = np.random.default_rng(3)
-    hidden = Disc((600.0, 260.0), 90.0)
-    arm = SimulatedArm(lambda at, time_s, height_mm: world.read(hidden, at.x_mm, at.y_mm, time_s=time_s, rng=rng))
-    circle = Circle(radius_mm=(50.0, 150.0), inside=True)
-    mixture = FixedMixture([1.0], [[0.0, 1.5]], [[[16.0, 0.0], [0.0, 6.25]]])
-    model = Chain(mixture, FixedLevels(10.0, 60.0), HypothesisScene(circle))
-    grid = Grid(n_x=66, n_y=33)
-    experiment = Experiment(circle, model, GaussianKnown(0.7), 0.7, grid, ReadingEntropy(), n_live=60, n_particles=500)
+    arm, experiment = arm_and_experiment((600.0, 260.0, 90.0), np.random.default_rng(3))
     run = run_from_place(FIRST, arm, experiment, rng=np.random.default_rng(5), max_readings=max_readings)
-    return replace(run, hidden=HiddenShape("circle", circle, (600.0, 260.0, 90.0)))
+    return replace(run, hidden=HiddenShape("circle", experiment.shape, (600.0, 260.0, 90.0)))
 
 
 @pytest.fixture(scope="module")

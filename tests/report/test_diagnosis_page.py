@@ -14,7 +14,7 @@ from probewise.diagnosis.light_sensor import LightSensorApparatus
 from probewise.recordings import Recording, paper_plan, read_plan, shipped
 from probewise.report import covariates
 from probewise.report import diagnosis as page
-from probewise.report.covariates import axis_label, is_scan_along_line
+from probewise.report.covariates import is_scan_along_line
 from probewise.report.diagnosis_figures import rows_of_scan_changed_most
 from probewise.report.residual_means import mean_residuals
 from probewise.scene import KnownScene
@@ -72,14 +72,6 @@ def test_a_scan_is_shown_along_its_way_with_each_reading(saturated):
 def test_a_repair_that_does_not_predict_is_said_not_to():
     assert page._heldout_gain_in_words(-1.0, 0.1).startswith("Worse than before")
     assert page._heldout_gain_in_words(0.1, 0.1).startswith("No better than before")
-
-
-def test_labels_carry_units():
-    recording = SimpleNamespace(plan=paper_plan())
-    found = SimpleNamespace(recording=recording, apparatus=LightSensorApparatus())
-    assert axis_label(found, "level") == "predicted reading (LEGO units)"
-    assert axis_label(found, "place", "edge_0") == "place along the scans, scan edge_0 (mm)"
-    assert axis_label(found, "battery_mv") == "battery (mV)"
 
 
 def test_residuals_are_averaged_in_even_steps_with_their_chance():
@@ -140,7 +132,7 @@ def test_places_come_as_the_headline_names_them_then_as_they_are_seen(monkeypatc
     sized = SimpleNamespace(
         diagnosis=found, means_in=lambda view: SimpleNamespace(largest_mean_in_sds=sizes[view.covariate])
     )
-    ordered = covariates.ResidualNoise.ranked_places(sized)
+    ordered = covariates.ResidualNoise.ranked_places.func(sized)
     assert [(place.covariate, seen) for place, seen in ordered] == [("place", True), ("time", True), ("slope", False)]
 
 

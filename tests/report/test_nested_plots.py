@@ -9,7 +9,8 @@ from scipy.integrate import trapezoid
 from scipy.stats import binom
 
 from probewise.errors import ParameterError
-from probewise.nested import NestedResult, run
+from probewise.nested import run
+from probewise.nested.result import Samples
 from probewise.priors import Product, Uniform
 from probewise.report import plots
 
@@ -34,39 +35,10 @@ def result():
     return run(Bell("x_mm", "angle_rad", "I_min"), rng=np.random.default_rng(0), n_live=100)
 
 
-def synthetic(n_params, n=600, n_live=50):
-    """As a run would leave it, without running one: a bell in many dimensions."""
-    rng = np.random.default_rng(1)
-    theta = rng.normal(size=(n, n_params))
-    ln_l = np.sort(-0.5 * (theta**2).sum(axis=1))
-    return NestedResult(
-        names=tuple(f"p{i}" for i in range(n_params)),
-        theta=theta,
-        log_likelihood=ln_l,
-        label=np.zeros(n),
-        log_weight=np.full(n, -np.log(n)),
-        log_birth=np.full(n, -np.inf),
-        birth_label=np.ones(n),
-        parent=np.full(n, -1),
-        n_at_death=np.full(n, n_live),
-        log_start=0.0,
-        log_start_error=0.0,
-        log_z=-3.0,
-        log_z_error=0.1,
-        memory=1.0,
-        information=2.0,
-        n_eff=float(n),
-        n_calls=n,
-        n_live=n_live,
-        stop_reason="made up",
-        complete=True,
-        insertion_rank=np.arange(n) % n_live,
-        insertion_n_ranked=np.full(n, n_live - 1),
-        insertion_p_value=0.5,
-        seed_state="{}",
-        versions={},
-        warnings=(),
-    )
+def bell_samples(n_params, n=600):
+    theta = np.random.default_rng(1).normal(size=(n, n_params))
+    names = tuple(f"p{i}" for i in range(n_params))
+    return Samples(names, theta, -0.5 * (theta**2).sum(axis=1), np.full(n, -np.log(n)), -3.0, 0.1, float(n), n)
 
 
 def test_a_trace_shows_every_dead_point_against_the_volume_left(result):
@@ -88,7 +60,7 @@ def test_a_trace_shows_every_dead_point_against_the_volume_left(result):
 @pytest.mark.slow
 @pytest.mark.parametrize("n_params", [1, 2, 10])
 def test_a_corner_has_each_parameter_and_each_pair(n_params):
-    axes = plots.corner_plot(synthetic(n_params))
+    axes = plots.corner_plot(bell_samples(n_params))
     assert axes.shape == (n_params, n_params)
     drawn = [[ax is not None for ax in row] for row in axes]
     assert np.array_equal(drawn, np.tril(np.ones((n_params, n_params), dtype=bool)))
@@ -101,7 +73,7 @@ def test_a_corner_has_each_parameter_and_each_pair(n_params):
 
 def test_a_corners_regions_hold_what_they_say():
     """Of samples of a plane bell, 95 % and 68 % lie within the two contours, smoothing widening them a little."""
-    result = synthetic(2, n=20_000)
+    result = bell_samples(2, n=20_000)
     ax = plots.corner_plot(result)[1, 0]
     lines = ax.collections[-1]
     for path, mass in zip(lines.get_paths(), (0.95, 0.68), strict=True):

@@ -122,27 +122,6 @@ def test_patterns_alone_make_sheets_and_what_no_outline_draws_is_a_picture():
     assert b"/Subtype /Image" in sheets_pdf(sheets, paper="a4", title="t")
 
 
-@pytest.mark.slow
-def test_marks_and_targets_are_at_their_places_of_the_field():
-    geometry = read_geometry(shipped_geometry_path())
-    sheet = marks_sheet(geometry)
-    assert len(sheet.crosses_mm) == 8
-    assert geometry.contains(sheet.crosses_mm).all()
-    tiles = tiles_of(sheet, "a4")
-    pages = pages_of(sheets_pdf([sheet], paper="a4", title="t"))[1:]
-    found = set()
-    for tile, page in zip(tiles, pages, strict=True):
-        shift = np.array(tile.low_mm) - [LEFT_MM, BOTTOM_MM]
-        for how, points in page[1]:
-            if how == "S" and len(points) == 2 and np.ptp(points) > 15 and abs(np.ptp(points[:, 0]) - 30) < 0.02:
-                found.add(tuple(np.round(points.mean(axis=0) + shift, 1).tolist()))
-        labels = [box for box in filled(page) if np.ptp(box, axis=0).max() < 40]
-        assert len(labels) == (tile.column < 5) + (tile.row < 1)
-    assert {tuple(mark) for mark in sheet.crosses_mm.tolist()} <= found
-    cut = pages_of(sheets_pdf([target_sheet("circle", CIRCLE)], paper="a4", title="t"))[1:]
-    assert any(np.ptp(points, axis=0) == pytest.approx([160, 160], abs=0.02) for _, points in cut[0][1])
-
-
 def crosses_in(pdf, sheet):
     """Centres of the crosses of a sheet's pages, in the sheet's frame: lines of 30 mm that cross at their middles."""
     found = []
@@ -152,6 +131,21 @@ def crosses_in(pdf, sheet):
         for across in (points for points in lines if np.ptp(points, axis=0) == pytest.approx([30, 0], abs=0.01)):
             found.append(tuple(np.round(across.mean(axis=0) + shift, 2).tolist()))
     return found
+
+
+@pytest.mark.slow
+def test_marks_and_targets_are_at_their_places_of_the_field():
+    geometry = read_geometry(shipped_geometry_path())
+    sheet = marks_sheet(geometry)
+    assert len(sheet.crosses_mm) == 8
+    assert geometry.contains(sheet.crosses_mm).all()
+    pdf = sheets_pdf([sheet], paper="a4", title="t")
+    for tile, page in zip(tiles_of(sheet, "a4"), pages_of(pdf)[1:], strict=True):
+        labels = [box for box in filled(page) if np.ptp(box, axis=0).max() < 40]
+        assert len(labels) == (tile.column < 5) + (tile.row < 1)
+    assert {tuple(mark) for mark in sheet.crosses_mm.tolist()} <= set(crosses_in(pdf, sheet))
+    cut = pages_of(sheets_pdf([target_sheet("circle", CIRCLE)], paper="a4", title="t"))[1:]
+    assert any(np.ptp(points, axis=0) == pytest.approx([160, 160], abs=0.02) for _, points in cut[0][1])
 
 
 @pytest.mark.parametrize("elbow_is_relative", [False, True])

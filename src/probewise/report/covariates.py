@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -156,6 +157,7 @@ class ResidualNoise:
             absorbed=self.absorbed,
         )
 
+    @cached_property
     def first_view(self) -> CovariateView:
         """Choose the first figure's covariate: the first candidate with a mean of 2.3 sds or more, else the largest.
 
@@ -164,7 +166,7 @@ class ResidualNoise:
         """
         diagnosis, before, after = self.diagnosis, self.diagnosis.before, self.diagnosis.after
         candidates: list[CovariateView] = []
-        for place, _ in self.ranked_places():
+        for place, _ in self.ranked_places:
             if diagnosis.verdict != "clean" or place.p_value < ALARM:
                 candidates += views_of_place(diagnosis, place)
         if diagnosis.repair_changes_predictions and diagnosis.verdict != "clean":
@@ -176,6 +178,7 @@ class ResidualNoise:
         seen = [view for view, size in zip(candidates, sizes, strict=True) if size >= _SEEN]
         return seen[0] if seen else candidates[np.argmax(sizes)]
 
+    @cached_property
     def ranked_places(self) -> list[tuple[Place, bool]]:
         """List the places with significant residuals, each with True if a mean residual reaches 2.3 sds.
 
@@ -198,6 +201,12 @@ class ResidualNoise:
             ):
                 shown.append((place, is_seen))
         return shown
+
+
+@lru_cache(maxsize=1)
+def noise_of(diagnosis: Diagnosis) -> ResidualNoise:
+    """Return the noise of a diagnosis's residuals, the same for its figures and its page."""
+    return ResidualNoise(diagnosis)
 
 
 def views_of_place(diagnosis: Diagnosis, place: Place) -> list[CovariateView]:

@@ -44,9 +44,9 @@ from probewise.effects import name_without_copy_suffix
 from probewise.recordings import write_plan
 from probewise.report import html
 from probewise.report.covariates import (
-    ResidualNoise,
     category_name_by_value,
     covariate_in_words_and_unit,
+    noise_of,
     term_family_in_words,
 )
 from probewise.report.diagnosis_figures import figure_drawers, first_figure_content, noun_of_held_out_part
@@ -280,7 +280,7 @@ def _place_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> Sequenc
         return ("No residual is larger than noise explains.",)
     shown = [
         html.figure(drawn[place.figure_name], _place_caption(diagnosis, place, seen=seen))
-        for place, seen in ResidualNoise(diagnosis).ranked_places()
+        for place, seen in noise_of(diagnosis).ranked_places
     ]
     opening = (
         f"Residuals of the {diagnosis.apparatus.words.unrepaired} model against each covariate in which they are "

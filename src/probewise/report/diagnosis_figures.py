@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import cache, partial
+from functools import partial
 from typing import cast
 
 import numpy as np
@@ -18,9 +18,9 @@ from probewise.effects import Effect
 from probewise.recordings import Plan
 from probewise.report.covariates import (
     CovariateView,
-    ResidualNoise,
     axis_label,
     is_scan_along_line,
+    noise_of,
     time_without_gaps,
     view_along_scan,
     views_of_place,
@@ -37,12 +37,11 @@ _LOST = 5.0  # sds from the prediction beyond which a reading at the lost readin
 
 def figure_drawers(diagnosis: Diagnosis) -> dict[str, Callable[[], bytes]]:
     """List a diagnosis's figures by file name, as functions that draw SVGs."""
-    chance = cache(partial(ResidualNoise, diagnosis))
     drawers: dict[str, Callable[[], bytes]] = {
-        "first.svg": lambda: svg(draw_first_figure(chance())),
+        "first.svg": lambda: svg(draw_first_figure(diagnosis)),
         "before_after.svg": lambda: svg(before_and_after(diagnosis)),
         "residuals.svg": lambda: _all_residuals_svg(diagnosis),
-        "noise.svg": lambda: _noise_tests_svg(chance()),
+        "noise.svg": lambda: _noise_tests_svg(diagnosis),
     }
     gain = diagnosis.improvement
     if gain.heldout_by_scan:
@@ -51,7 +50,7 @@ def figure_drawers(diagnosis: Diagnosis) -> dict[str, Callable[[], bytes]]:
     for effect in cast(Sequence[Effect], diagnosis.repaired.chain.effects):
         if effect.name.startswith("curve:"):
             drawers[figure_name_of(effect.name)] = partial(_curve_svg, diagnosis, effect)
-    return drawers | {place.figure_name: partial(_place_svg, chance, place) for place in diagnosis.where}
+    return drawers | {place.figure_name: partial(_place_svg, diagnosis, place) for place in diagnosis.where}
 
 
 def noun_of_held_out_part(diagnosis: Diagnosis) -> str:
@@ -60,7 +59,7 @@ def noun_of_held_out_part(diagnosis: Diagnosis) -> str:
     return diagnosis.apparatus.words.run if held <= {*diagnosis.recording.plan.scan_names} else "part"
 
 
-def first_figure_content(diagnosis: Diagnosis, chance: ResidualNoise | None = None) -> CovariateView | str:
+def first_figure_content(diagnosis: Diagnosis) -> CovariateView | str:
     """Choose the content of a diagnosis's first figure: "readings" if they are too few for a diagnosis.
 
     For the verdict `noise` it is the name of the largest noise effect, else a view of residuals along a covariate.
@@ -70,27 +69,26 @@ def first_figure_content(diagnosis: Diagnosis, chance: ResidualNoise | None = No
     if diagnosis.verdict == "noise":
         sizes = {effect.name: effect.size_lambda for effect in diagnosis.effects}
         return max(diagnosis.combination, key=lambda name: sizes.get(name, 0.0))
-    return (chance or ResidualNoise(diagnosis)).first_view()
+    return noise_of(diagnosis).first_view
 
 
-def draw_first_figure(chance: ResidualNoise) -> AxesGrid:
+def draw_first_figure(diagnosis: Diagnosis) -> AxesGrid:
     """Draw the first figure's content (`first_figure_content`) and, below it, the probability of each explanation.
 
     Return both axes, (2,).
     """
-    diagnosis = chance.diagnosis
     listed = [h for h in diagnosis.hypotheses if h.probability > _WORTH_A_BAR]
     names, most = [hypothesis_in_words(h.effects) for h in listed], min(len(listed), _MOST_BARS)
     bars = [*names[:most], *["others"] * (len(diagnosis.hypotheses) > most)]
     axes = stack_of_axes([2.7, height_of_bars_in(bars)], aligned=False)
     above, below = axes
-    shown = first_figure_content(diagnosis, chance)
+    shown = first_figure_content(diagnosis)
     if shown == "readings":
         plots.readings_in_order(diagnosis.recording, ax=above)
     elif isinstance(shown, str):
-        _draw_noise_panel(chance, shown, above)
+        _draw_noise_panel(diagnosis, shown, above)
     else:
-        _draw_means_along(chance, shown, after=True, each=False, ax=above)
+        _draw_means_along(diagnosis, shown, after=True, each=False, ax=above)
     # All are passed on: the last bar adds up those that are not drawn.
     names += [""] * (len(diagnosis.hypotheses) - len(listed))
     probabilities = [h.probability for h in (*listed, *diagnosis.hypotheses[len(listed) :])]
@@ -98,13 +96,12 @@ def draw_first_figure(chance: ResidualNoise) -> AxesGrid:
     return axes
 
 
-def _place_svg(chance: Callable[[], ResidualNoise], place: Place) -> bytes:
+def _place_svg(diagnosis: Diagnosis, place: Place) -> bytes:
     """Draw the calibrated model's residuals in each view of a place: readings, means, the band of chance."""
-    noise = chance()
-    views = views_of_place(noise.diagnosis, place)
+    views = views_of_place(diagnosis, place)
     axes = stack_of_axes([2.4, 2.6][-len(views) :])
     for ax, view in zip(axes, views, strict=True):
-        _draw_means_along(noise, view, after=False, each=True, ax=ax)
+        _draw_means_along(diagnosis, view, after=False, each=True, ax=ax)
     return svg(axes)
 
 
@@ -124,10 +121,9 @@ def _curve_svg(diagnosis: Diagnosis, curve: Effect) -> bytes:
     return svg(ax)
 
 
-def _draw_means_along(chance: ResidualNoise, view: CovariateView, *, after: bool, each: bool, ax: Axes) -> None:
-    diagnosis = chance.diagnosis
+def _draw_means_along(diagnosis: Diagnosis, view: CovariateView, *, after: bool, each: bool, ax: Axes) -> None:
     plots.mean_residuals_along(
-        chance.means_in(view, after=after),
+        noise_of(diagnosis).means_in(view, after=after),
         label=view.label,
         unit=diagnosis.recording.plan.instrumentation.unit_after_number,
         each=(view.at, diagnosis.before.residuals) if each else None,
@@ -182,18 +178,18 @@ def _all_residuals_svg(diagnosis: Diagnosis) -> bytes:
     return svg(plots.residuals_against_covariates(covariates, models, unit=unit))
 
 
-def _noise_tests_svg(chance: ResidualNoise) -> bytes:
+def _noise_tests_svg(diagnosis: Diagnosis) -> bytes:
     """Draw the tests of the noise model: autocorrelation, spread by predicted reading, histogram."""
     axes = stack_of_axes([2.2, 2.4, 2.2])
     for ax, name in zip(axes, ("correlated_noise", "signal_dependent_noise", "outliers"), strict=True):
-        _draw_noise_panel(chance, name, ax)
+        _draw_noise_panel(diagnosis, name, ax)
     return svg(axes)
 
 
-def _draw_noise_panel(chance: ResidualNoise, name: str, ax: Axes) -> None:
+def _draw_noise_panel(diagnosis: Diagnosis, name: str, ax: Axes) -> None:
     """Draw a noise effect's panel; for other names, spread by predicted reading."""
-    diagnosis, recording = chance.diagnosis, chance.diagnosis.recording
-    predicted, residuals, sd = diagnosis.after.readings, np.array(diagnosis.after.residuals), float(chance.sd.mean())
+    recording, noise_sd = diagnosis.recording, noise_of(diagnosis).sd
+    predicted, residuals, sd = diagnosis.after.readings, np.array(diagnosis.after.residuals), float(noise_sd.mean())
     unit = recording.plan.instrumentation.unit_after_number
     found = {p.name: p.mean for p in diagnosis.noise.parameters}
     # Lost readings carry no information on the noise of the others.
@@ -206,7 +202,7 @@ def _draw_noise_panel(chance: ResidualNoise, name: str, ax: Axes) -> None:
         walking = residuals + diagnosis.after.walk
         plots.residual_autocorrelation(walking, recording.plan.scan, rho=found.get("rho"), ax=ax)
     elif name in ("outliers", "dropouts"):
-        plots.residual_histogram(residuals / chance.sd, 1.0, ax=ax)
+        plots.residual_histogram(residuals / noise_sd, 1.0, ax=ax)
     else:
-        model_sd = chance.sd if np.ptp(chance.sd) > 0 else None
+        model_sd = noise_sd if np.ptp(noise_sd) > 0 else None
         plots.spread_by_level(predicted, residuals, unit=unit, model_sd=model_sd, ax=ax)

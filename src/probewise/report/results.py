@@ -19,7 +19,6 @@ from probewise.investigation import Investigation
 from probewise.nested.result import Samples
 from probewise.recordings import Prediction, Recording
 from probewise.report import audit, calibration, diagnosis, exploration, fit, investigation
-from probewise.report.covariates import ResidualNoise
 from probewise.report.diagnosis_figures import draw_first_figure
 from probewise.report.html import element, figure
 from probewise.report.plots.canvas import AxesGrid, figure_of, png, text_as_it_is
@@ -59,7 +58,7 @@ _DRAWINGS: dict[type, tuple[Callable[[Any], Axes | AxesGrid], str]] = {
     Prediction: (_draw_predicted, "Predicted readings, each with its 95 % band."),
     Samples: (lambda value: corner_plot(value, parameters=value.names[:_MOST_PARAMETERS]), _POSTERIOR),
     Exploration: (exploration.draw_last_view, "The robot's view at the end."),
-    Diagnosis: (lambda value: draw_first_figure(ResidualNoise(value)), "Residuals, and probabilities of explanations."),
+    Diagnosis: (draw_first_figure, "Residuals, and probabilities of explanations."),
     SystemFit: (fit.draw_recorded_against_predicted, _ON_THE_LINE),
     SystemPrediction: (_draw_recorded_against_predicted, _ON_THE_LINE),
     PlanAudit: (audit.draw_detectability_and_aliases, "Detectability of effects, and aliases."),

@@ -129,8 +129,8 @@ class Margins(LayoutEngine):
         self._aligned = aligned
 
     def execute(self, fig: Figure) -> None:
-        """Place the axes, then again with the ticks and legends that fit there."""
-        for _ in range(2):
+        """Place the axes, then again with the ticks that fit there, and with the legends that fit beside these."""
+        for _ in range(3):
             _place_axes(fig, aligned=self._aligned)
 
 
@@ -165,13 +165,22 @@ def _rooms_about_in(ax: Axes) -> tuple[float, float, float, float]:
     """Return the room that the texts of axes need on the left, on the right, below and above, in inches."""
     if not ax.get_visible():
         return 0.0, 0.0, 0.0, 0.0
-    right = max((_size_in(text)[0] for text in ax.get_xticklabels()), default=0.0) / 2
-    for bar in ax.child_axes:
-        right = _BAR_ENDS * ax.get_position().width * figure_of(ax).get_figwidth() + _axis_room_in(bar.yaxis, 0)
     titles = [ax.get_title(), ax.get_title("left"), ax.yaxis.get_offset_text().get_text()]
     above = [_height_in(text, mpl.rcParams["font.size"]) + _PAD_IN for text in titles if text]
-    above.append(_legend_height_in(ax.get_legend()))
+    above += [_beyond_in(ax, 1), _legend_height_in(ax.get_legend())]
+    right = _beyond_in(ax, 0)
+    for bar in ax.child_axes:
+        right = _BAR_ENDS * ax.get_position().width * figure_of(ax).get_figwidth() + _axis_room_in(bar.yaxis, 0)
     return _axis_room_in(ax.yaxis, 0), right + _PAD_IN, _axis_room_in(ax.xaxis, 1), max(above) + _PAD_IN
+
+
+def _beyond_in(ax: Axes, side: int) -> float:
+    """Return how far tick labels reach to the right of axes (`side` 0), or above them (1)."""
+    end, dpi = (ax.bbox.x1, ax.bbox.y1)[side], figure_of(ax).dpi
+    texts = (ax.get_xticklabels, ax.get_yticklabels)[side]()
+    places = [text.get_transform().transform(text.get_position())[side] for text in texts]
+    reached = [_size_in(t)[side] / 2 + (at - end) / dpi for t, at in zip(texts, places, strict=True) if at <= end + 1]
+    return max([0.0, *map(float, reached)])
 
 
 def _axis_room_in(axis: Axis, side: int) -> float:
@@ -335,7 +344,7 @@ def legend_below(axes: Axes | AxesGrid, *, n_columns: int = 4, ground: str = "no
     if handles:
         style: dict[str, Any] = {"facecolor": ground, "framealpha": 1.0, "edgecolor": "none", "labelcolor": ink}
         columns = min(n_columns, len(handles))
-        place: dict[str, Any] = {"loc": "lower center", "ncols": columns, "frameon": ground != "none"}
+        place: dict[str, Any] = {"loc": "outside lower center", "ncols": columns, "frameon": ground != "none"}
         _COLUMNS[sheet.legend([*handles.values()], [*handles], fontsize=SMALL_PT, **place, **style)] = columns
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TypeAlias
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,17 +10,16 @@ from matplotlib.colors import Colormap, LinearSegmentedColormap
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
-from scipy.stats import binom
+from scipy.special import bdtrik
 
 from probewise._arrays import FloatArray
 from probewise._kinds import require_kind, require_like
 from probewise._words import unit_of_name
 from probewise.errors import require
-from probewise.nested import NestedResult, Weighted
+from probewise.nested import NestedResult
+from probewise.nested.result import Samples
 from probewise.report.plots import canvas
 from probewise.report.words import value_and_interval_texts, value_with_error, words_without_unit
-
-Posterior: TypeAlias = NestedResult | Weighted
 
 # Darker points have more weight, so that they show on white; lightness falls evenly, so that it can be read in grey.
 _WEIGHT: Colormap = LinearSegmentedColormap.from_list(
@@ -46,7 +44,7 @@ def trace_plot(result: NestedResult, *, parameters: Sequence[str] | None = None)
     depth, mass = _depth_and_mass_per_nat(result)
     shown = np.argsort(mass, kind="stable")
     _draw_mass(axes[0, 0], depth, mass)
-    canvas.label_axes(axes[0, 0], x="", y="posterior\nper nat", title=_evidence_text(result))
+    canvas.label_axes(axes[0, 0], x="", y="mass per nat", title=_evidence_text(result))
     for ax, i in zip(axes[1:, 0], columns, strict=True):
         ax.scatter(
             depth[shown], result.theta[shown, i], s=5, linewidths=0, rasterized=True, c=mass[shown], cmap=_WEIGHT
@@ -57,7 +55,7 @@ def trace_plot(result: NestedResult, *, parameters: Sequence[str] | None = None)
     return axes
 
 
-def corner_plot(result: Posterior, *, parameters: Sequence[str] | None = None) -> canvas.AxesGrid:
+def corner_plot(result: Samples, *, parameters: Sequence[str] | None = None) -> canvas.AxesGrid:
     """Draw the marginal posterior of each parameter, and 68 % and 95 % regions of each pair.
 
     Intervals of single parameters are central ones; up to six parameters, which fit the width of a page, also have
@@ -123,7 +121,7 @@ def insertion_plot(result: NestedResult, *, ax: Axes | None = None) -> Axes:
     counts = np.diff([np.clip((edge - first) / width, 0.0, 1.0).sum() for edge in edges])
     n_bars = len(counts)
     tail = (1.0 - 0.99 ** (1.0 / n_bars)) / 2.0
-    low, high = (float(binom.ppf(q, n, 1.0 / n_bars)) for q in (tail, 1.0 - tail))
+    low, high = (float(np.ceil(bdtrik(q, n, 1.0 / n_bars))) for q in (tail, 1.0 - tail))  # quantiles of a binomial
     colour = np.where((counts < low) | (counts > high), canvas.VERMILLION, _SHADES[0])
     ax.bar(edges[:-1], counts, 1.0 / n_bars, align="edge", color=colour, edgecolor="white", linewidth=0.6)
     ax.axhspan(low, high, label="99 % of correct runs", **canvas.BAND)
@@ -171,11 +169,11 @@ def _draw_mass(ax: Axes, depth: FloatArray, mass: FloatArray) -> None:
     ax.set_ylim(bottom=0)
 
 
-def _evidence_text(result: Posterior) -> str:
+def _evidence_text(result: Samples) -> str:
     return f"ln Z = {value_with_error(result.log_z, result.log_z_error)}"
 
 
-def _checked_parameter_columns(result: Posterior, parameters: Sequence[str] | None) -> list[int]:
+def _checked_parameter_columns(result: Samples, parameters: Sequence[str] | None) -> list[int]:
     require_like("result", result, ("names", "theta"), f"{_A_RUN}, or weighted samples")
     require(result.names, "names", result.names, "one parameter or more; without any there is nothing to draw")
     if parameters is None:
@@ -196,7 +194,7 @@ def _depth_and_mass_per_nat(result: NestedResult) -> tuple[FloatArray, FloatArra
     return -result.log_volume, result.weight * result.n_at_death
 
 
-def _axis_limits(result: Posterior, column: int) -> tuple[float, float]:
+def _axis_limits(result: Samples, column: int) -> tuple[float, float]:
     """Return a parameter's axis limits: its central 99 % interval with a margin, within the range of the points."""
     values = result.theta[:, column]
     low, high = result.interval(0.99)[:, column]
@@ -225,7 +223,7 @@ def _centres_and_smoothed_density(
     return centres, np.asarray(gaussian_filter1d(density, width, mode="reflect"))
 
 
-def _draw_marginal(ax: Axes, result: Posterior, column: int, span: tuple[float, float], *, titled: bool) -> None:
+def _draw_marginal(ax: Axes, result: Samples, column: int, span: tuple[float, float], *, titled: bool) -> None:
     centres, density = _centres_and_smoothed_density(result.theta[:, column], result.weight, span, result.n_eff)
     cuts = result.interval(_MASSES[1])[:, column], result.interval(_MASSES[0])[:, column]
     ax.plot(centres, density, color=canvas.BLUE)
@@ -241,7 +239,7 @@ def _draw_marginal(ax: Axes, result: Posterior, column: int, span: tuple[float, 
 
 
 def _draw_pair(
-    ax: Axes, result: Posterior, columns: tuple[int, int], spans: tuple[tuple[float, float], tuple[float, float]]
+    ax: Axes, result: Samples, columns: tuple[int, int], spans: tuple[tuple[float, float], tuple[float, float]]
 ) -> None:
     x, y = (result.theta[:, i] for i in columns)
     density, x_edges, y_edges = np.histogram2d(x, y, bins=48, range=spans, weights=result.weight)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import textwrap
 from collections.abc import Mapping, Sequence
 
@@ -43,8 +44,9 @@ def hypothesis_probabilities(
 
 def height_of_bars_in(names: Sequence[str]) -> float:
     """Return the height of a drawing of bars with these labels, three or more."""
-    lines = sum(max(len(textwrap.wrap(name, _LETTERS)), 1) + 1 for name in names)
-    return 0.6 + 0.16 * max(lines, 6)
+    lines = [max(len(textwrap.wrap(name, _LETTERS)), 1) for name in names]
+    most = max((one + other for one, other in itertools.pairwise(lines)), default=2) / 2  # from one bar to the next
+    return 0.6 + 0.16 * max(len(names), 3) * (1 + most)
 
 
 def _stacked(beliefs: Sequence[Mapping[str, float]], first: Sequence[str] = ()) -> list[tuple[str, str, FloatArray]]:
@@ -71,7 +73,7 @@ def probabilities_by_round(beliefs: Mapping[str, Mapping[str, float]], *, ax: Ax
     """
     parts = _stacked([*beliefs.values()])
     lines = sum(len(textwrap.wrap(name, _LETTERS)) for name, *_ in parts)
-    ax = canvas.axes_or_new(ax, size_in=(canvas.PANEL_IN, 1.1 + 0.5 * len(beliefs) + 0.16 * lines))
+    ax = canvas.axes_or_new(ax, size_in=(canvas.PANEL_IN, 1.1 + 0.5 * len(beliefs) + 0.2 * lines))
     at, left = np.arange(len(beliefs)), np.zeros(len(beliefs))
     for name, colour, share in parts:
         ax.barh(at, share, left=left, color=colour, label=name, height=0.6, edgecolor="white", linewidth=0.5)

@@ -50,6 +50,7 @@ CHANGES = {
     "the height": ({"height_mm": 20}, [], "height_mm is None there, 20.0 here"),
     "the orientation": ({"orientation_rad": [0, 0, 0.2, 0]}, [], "the orientation of reading 3 differs"),
     "a place": ({"x_mm": [-20, -10, 10, 26]}, [], "the x_mm of reading 4 differs"),
+    "a place across": ({"y_mm": [0, 0, 6, 0]}, [], "the y_mm of reading 3 differs"),
     "a pattern": ({"patterns": {"edge": Quadrant((0.0, 0.0), (1, 1))}}, [], "pattern 'edge' is HalfPlane("),
     "its length": ({"x_mm": [-20, -10, 10]}, [], "it has 4 rows, this plan 3"),
 }

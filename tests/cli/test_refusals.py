@@ -86,6 +86,7 @@ REFUSED = {
     "emulate-nxt --seed -1": "--seed",
     # options that contradict each other
     "study --model naive --learn-sensor": "learn_sensor is True; allowed: False with",
+    "study --clean 3": "--clean is '3'; allowed: none with a study without --concealed",
     "study --concealed --beside-paper": "--beside-paper is 'True'; allowed: none with --concealed",
     f"{INVESTIGATE} --origin-mm 1,2": "--origin-mm is '1,2'; allowed: none with",
     f"{INVESTIGATE} --geometry arm.toml": "--geometry is 'arm.toml'; allowed: none with",

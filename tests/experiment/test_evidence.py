@@ -119,7 +119,7 @@ def test_a_search_that_ends_in_a_false_mode_is_set_right_where_the_leader_has_th
     nearest = [places[np.hypot(*(places - at[:2]).T).argmin()].tolist() for at in _PLAYED]
     taken = [Reading(at[2], Pose(*place), 5.0 * k) for k, (place, at) in enumerate(zip(nearest, _PLAYED, strict=True))]
     recording, rng = experiment.problem(taken).recording, np.random.default_rng(seed)
-    kinds = experiment.kinds[0], [kind for kind in experiment.kinds if kind.left_out == "backlash"][3]
+    kinds = experiment.kinds[0], [kind for kind in experiment.kinds if kind.left_out == "backlash"][1]
     start = prior_posterior(kinds, 600, rng=rng)
     led = from_nothing(kinds[0].problem(recording), rng=rng)
     leader = replace(start.particles[0], weighted=led, ancestor=np.arange(len(led.theta)), lost_log_z=-math.inf)

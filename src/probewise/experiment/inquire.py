@@ -1,10 +1,10 @@
 """Inquire: the utility of every available reading, and the choice of the next (paper, section 2.3).
 
-Far from the end, the utility is the experiment's, with the sensor model alone, unless that is surely incomplete. Near
-the end of a run with doubt in its sensor, several kinds of hypotheses may explain all readings and differ in the shape.
-Then the utility is the expected information about all kinds together; once some reading has a chance of 25 % or more to
-meet the stopping rule, that chance: kinds that are aliased but agree on the shape need not be distinguished. Bits about
-the left-out effect are added.
+Far from the end, and while no rival was searched, the utility is the experiment's, with the sensor model alone, unless
+that is surely incomplete. Near the end of a run with doubt in its sensor, several kinds of hypotheses may explain all
+readings and differ in the shape. Then the utility is the expected information about all kinds together; once some
+reading has a chance of 25 % or more to meet the stopping rule, that chance: kinds that are aliased but agree on the
+shape need not be distinguished. Bits about the left-out effect are added.
 
 Before such a run ends, two things are checked. A dozen readings that fit the sensor model cannot exclude most left-out
 effects, and one further reading would show some. And if a shape was read from one side only, its far side follows from
@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.arm.carry_out import PATTERN
 from probewise.arm.instrument import Instrument, Pose, Reading
+from probewise.experiment.evidence import sleeping_mask
 from probewise.experiment.judgement import MOST_PROBABILITY_WRONG, WRONG_SDS, Judgement, theta_with_aligned_angles
 from probewise.experiment.kinds import PosteriorByKind
 from probewise.experiment.rivals import Pace
@@ -102,11 +103,13 @@ def inquire(
         left = goal.sd**2 - float(judged.arm_error.sd[lengths].max()) ** 2
         goal = replace(goal, sd=math.sqrt(left)) if left > 0 else goal
     inputs, utilities = predict_readings_and_utilities(experiment, posterior, drawn, reach, at=readings[-1], goal=goal)
-    if experiment.trust == 1:
+    asleep = by_kind.doubts_sensor and all(sleeping_mask(by_kind) | [not kind.left_out for kind in by_kind.kinds])
+    if experiment.trust == 1 or (asleep and not judged.target_reached):
         return inputs, utilities
-    raised = by_kind.with_raised_left_out_odds()
-    reached = judged.target_reached
-    return inputs, utilities_near_end(experiment, raised, inputs, utilities, readings, rng=rng, target_reached=reached)
+    of_all, mean, reached = by_kind.with_raised_left_out_odds(), judged.mean, judged.target_reached
+    return inputs, utilities_near_end(
+        experiment, of_all, inputs, utilities, readings, mean=mean, rng=rng, target_reached=reached
+    )
 
 
 def must_continue(utilities: UtilityMap, by_kind: PosteriorByKind) -> bool:
@@ -258,6 +261,7 @@ def utilities_near_end(
     utilities: UtilityMap,
     readings: tuple[Reading, ...],
     *,
+    mean: FloatArray,
     rng: np.random.Generator,
     target_reached: bool = False,
 ) -> UtilityMap:
@@ -280,8 +284,8 @@ def utilities_near_end(
     may_be_complete = by_kind.left_out.get("", 0.0) >= _LEAST_COMPLETE
     if may_be_complete and np.sqrt(spread.max()) > _NEAR_TARGET_SDS * experiment.stop_sd_mm:
         return utilities
-    mean = (inputs.weight @ inputs.theta[:, experiment.shape_columns])[None] / inputs.weight.sum()
-    unseen, shows_far_side = far_side(inputs, experiment.shape.region(mean), readings)
+    region = experiment.shape.region(mean[None])
+    unseen, shows_far_side = far_side(_places_mm(inputs), inputs.designs.grid, region, readings)
     far = () if unseen is None else (unseen,)
     rows = _candidate_designs(experiment, inputs, utilities, theta, readings, rng)
     rows = np.union1d(rows, far).astype(np.int64)
@@ -447,17 +451,27 @@ def _expected_bits_by_cells(
     return np.asarray(bits)
 
 
-def far_side(
-    inputs: UtilityInput, region: Region, readings: Sequence[Reading]
-) -> tuple[int | None, Callable[[FloatArray], BoolArray]]:
-    """Return the design on the side of one region that no reading has seen, and which places would show that side.
+def leaves_far_side(
+    experiment: Experiment, posterior: Weighted, reach: ArmReachAndTravel, readings: Sequence[Reading]
+) -> bool:
+    """Return whether a run with doubt in its sensor goes on in any case: no reading has seen the shape's far side."""
+    if experiment.trust == 1 or experiment.goal is None:
+        return False
+    region = experiment.shape.region((posterior.weight @ posterior.theta[:, experiment.shape_columns])[None])
+    return far_side(experiment.grid.places_mm[reach.reachable], experiment.grid, region, readings)[0] is not None
 
-    The design is the available one at the place on the outline within reach that is farthest from the readings at the
-    outline: None if one of these is nearer to that place than 0.75 of the diameter. The function marks places, (n, 2)
-    -> (n,), at which one more reading would leave none. A reading farther than one spacing of the grid from the outline
-    does not count. Of a region that is no ellipse or polygon, or out of reach, there is no far side.
+
+def far_side(
+    there: FloatArray, grid: Grid, region: Region, readings: Sequence[Reading]
+) -> tuple[int | None, Callable[[FloatArray], BoolArray]]:
+    """Return the place on the side of a region that no reading has seen, and which places would show that side.
+
+    The place is the number of that of `there`, the places within reach, (n_places, 2), which is nearest to the point of
+    the outline that is farthest from the readings at the outline: None if one of these is nearer to that point than
+    0.75 of the diameter. The function marks places, (n, 2) -> (n,), at which one more reading would leave none. A
+    reading farther than one spacing of the grid from the outline does not count. Of a region that is no ellipse or
+    polygon, or out of reach, there is no far side.
     """
-    there, grid = _places_mm(inputs), inputs.designs.grid
     spacing = max(grid.width_mm / (grid.n_x - 1), grid.height_mm / (grid.n_y - 1))
     edge = outlines(region)[0] if isinstance(region, EllipseRegion | PolygonRegion) else np.empty((0, 2))
     away = np.linalg.norm(edge[:, None] - there, axis=2)

@@ -25,6 +25,7 @@ from probewise.errors import DoubtfulResultWarning, FileError, LinkError, Parame
 from probewise.experiment.inquire import (
     ArmReachAndTravel,
     inquire,
+    leaves_far_side,
     must_continue,
     next_poses,
     predict_readings_and_utilities,
@@ -118,7 +119,7 @@ def step(
     readings = (*state.readings, reading)
     n_readings, n_missing = len(readings), n_missing_at_end(readings)
     recording = experiment.problem(readings).recording
-    by_kind, joined, posterior, drawn = infer(experiment, state.by_kind, recording, rng=rng)
+    by_kind, joined, posterior, drawn = infer(experiment, state, recording, readings, rng=rng)
     judged = judge(experiment, by_kind, posterior, readings, rng=rng)
     inputs, utilities = inquire(experiment, by_kind, posterior, drawn, judged, state.reach, readings, rng=rng)
     all_missing = max_missing is not None and n_missing >= max_missing
@@ -160,9 +161,14 @@ def step(
 
 
 def infer(
-    experiment: Experiment, previous: PosteriorByKind, recording: Recording, *, rng: np.random.Generator
+    experiment: Experiment,
+    state: ExplorationState,
+    recording: Recording,
+    readings: tuple[Reading, ...],
+    *,
+    rng: np.random.Generator,
 ) -> tuple[PosteriorByKind, Weighted, Weighted, FloatArray]:
-    """Update the posterior with the last reading of a recording; before the run may end, reconsider it.
+    """Update the posterior with the last of the readings; before the run may end, reconsider it.
 
     Returns
     -------
@@ -173,11 +179,13 @@ def infer(
     with warnings.catch_warnings():
         # Each step keeps its own notes; a warning per reading would hide them.
         warnings.simplefilter("ignore", DoubtfulResultWarning)
-        by_kind = method.updated(previous, recording, rng=rng)
+        by_kind = method.updated(state.by_kind, recording, rng=rng)
     joined = by_kind.with_raised_left_out_odds().joined(rng=rng)
     posterior = with_aligned_angles(experiment, joined)
     # A few kinds at a time: as soon as the target is missed, the others can wait.
-    while target_reached_and_chance_off(experiment, posterior)[0]:
+    while target_reached_and_chance_off(experiment, posterior)[0] and not leaves_far_side(
+        experiment, posterior, state.reach, readings
+    ):
         before, by_kind = by_kind, method.reconsidered(by_kind, recording, rng=rng)
         if by_kind is before:
             break

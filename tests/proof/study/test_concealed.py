@@ -56,6 +56,18 @@ def test_under_varied_conditions_the_robot_knows_noise_rounding_and_sensor():
     np.testing.assert_allclose(predicted, seen, atol=0.1)
 
 
+def test_a_scale_of_x_that_is_named_is_compared_as_it_was_put_right():
+    """Along X to the true lengths, or along Y to the arm's along X; unnamed, a circle lies between."""
+    trial = ConcealedTrial("scale_of_x", 2, 0, 0.9)
+    true = trial.circle_mm
+    for mean, name, right in (
+        (true + 1, "position_scale", true),
+        (true / 1.05 + 1, "position_scale", true / 1.05),
+        (true, CLEAN, true / [1.05, 1, 1]),
+    ):
+        np.testing.assert_allclose(trial.circle_found_as(name, mean), right)
+
+
 def test_forms_are_summed_up_by_form():
     run = {"known": True, "readings": 9, "error_mm": 1.0, "held": [True] * 3, "noticed": True, "cpu_s": [0.1, 0.2]}
     results = {

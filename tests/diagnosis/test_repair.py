@@ -20,7 +20,11 @@ from probewise.diagnosis.prepared import Prepared, rows_to_diagnose
 from probewise.recordings import Plan, Recording, Uniform
 
 LAG = SimpleNamespace(
-    name="lag", counted_from="", amplitudes=(), sentence=lambda mean, sd: f"it lags by {mean[0]:.0f} s"
+    name="lag",
+    counted_from="",
+    covariates=("time",),
+    amplitudes=(),
+    sentence=lambda mean, sd: f"it lags by {mean[0]:.0f} s",
 )
 
 

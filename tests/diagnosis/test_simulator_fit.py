@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 from probewise.diagnosis import diagnose_system
 from probewise.diagnosis.diagnose_simulator import (
-    _notes_on_integration,
     fit_system,
+    notes_on_simulator,
     recording_from_table,
     with_step_for_likely_parameters,
 )
@@ -100,7 +102,10 @@ def test_a_law_that_needs_more_steps_than_are_taken_says_so(stiff, monkeypatch):
 
 @pytest.mark.parametrize("sets_step", [True, False])
 def test_a_search_that_was_cut_short_advises_a_larger_step_only_where_one_was_set(sets_step):
-    (note,) = _notes_on_integration(Integrations(cut_short=True), 1000, sets_step=sets_step)
+    law = SimpleNamespace(max_step_s=0.1 if sets_step else None)
+    simulator = SimpleNamespace(law=law, noise=SimpleNamespace(sd=None))
+    system = SimpleNamespace(caller=None, integrations=Integrations(cut_short=True), simulator=simulator)
+    (note,) = notes_on_simulator(SimpleNamespace(system=system, evaluations_of_a_search=1000), None)
     assert "after 1,000 evaluations" in note
     assert ("max_step_s" in note) is sets_step
 

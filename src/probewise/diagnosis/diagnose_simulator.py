@@ -96,7 +96,8 @@ def _differences(system: System, table: RunTable) -> FloatArray:
     def changed(step: float) -> BoolArray:
         """Return at which points, of which coordinates: (n_params, n_points)."""
         theta = system.theta((system.starts - step * eye[:, None]).reshape(-1, system.n_params))
-        change = chain.predict(theta, table).reshape(system.n_params, *about.shape) - about
+        with np.errstate(invalid="ignore"):  # between two infinite readings there is no change
+            change = chain.predict(theta, table).reshape(system.n_params, *about.shape) - about
         return np.asarray((np.isfinite(change) & (change != 0)).any(axis=2))
 
     if not (changed(DIFFERENCE).mean(axis=1) > 0.5).all():

@@ -197,6 +197,10 @@ class TangentModel:
         """What tells that many predictions cost little: the model itself."""
         return self
 
+    def difference_points_and_steps(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the points and steps of the model itself."""
+        return self.model.difference_points_and_steps(z)
+
     def predict_rows(self, rows: IntArray, z: FloatArray) -> FloatArray:
         """Return approximate readings of some rows, (n_samples, n_params) -> (n_samples, n_rows)."""
         moved, n_own = z - self.z, self.system.n_params

@@ -377,9 +377,14 @@ def finish(ax: Axes, *, x: str, y: str, plain: Literal["x", "y", "both"] | None 
 
 def draw_map(ax: Axes, values: FloatArray, x: FloatArray, y: FloatArray, **style: Any) -> AxesImage:
     """Draw values, (n_y, n_x), lower row first, as pixels about even places, (n_x,) and (n_y,); NaN is blank."""
+    where: dict[str, Any] = {"origin": "lower", "extent": extent_of_map(x, y)}
+    return ax.imshow(np.ma.masked_invalid(values), interpolation="nearest", **where, **style)
+
+
+def extent_of_map(x: FloatArray, y: FloatArray) -> tuple[float, float, float, float]:
+    """Return the outer edges of pixels about even places: left, right, below, above."""
     dx, dy = (x[1] - x[0]) / 2, (y[1] - y[0]) / 2
-    extent = (float(x[0] - dx), float(x[-1] + dx), float(y[0] - dy), float(y[-1] + dy))
-    return ax.imshow(np.ma.masked_invalid(values), origin="lower", extent=extent, interpolation="nearest", **style)
+    return float(x[0] - dx), float(x[-1] + dx), float(y[0] - dy), float(y[-1] + dy)
 
 
 def paint_out_of_reach(ax: Axes) -> None:

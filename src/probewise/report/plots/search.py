@@ -63,6 +63,7 @@ def playing_field(
         earlier.remove()
     if ax.images:
         ax.images[0].set_data(np.ma.masked_invalid(utility))
+        ax.images[0].set_extent(canvas.extent_of_map(x_mm, y_mm))
         ax.images[0].set_clim(0.0, top)
     else:
         canvas.draw_map(ax, utility, x_mm, y_mm, cmap=canvas.COPPER, vmin=0.0, vmax=top)

@@ -35,4 +35,3 @@ axes = plots.residuals_against_covariates(
     [("as calibrated", before.residuals), ("repaired", after.residuals)],
     unit="LEGO units",
 )
-axes[0].figure.tight_layout()

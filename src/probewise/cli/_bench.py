@@ -140,9 +140,8 @@ def open_arm(
 
     reach = reach or Reach()
     last = last or Reading(math.nan, Pose(*reach.rest_mm), start_s)
-    return SimulatedArm(read_world, reach=reach, scale=scale, height_mm=world.height_mm, last=last), SimulatedBench(
-        table
-    )
+    simulated = SimulatedArm(read_world, reach=reach, scale=scale, height_mm=world.height_mm, last=last)
+    return simulated, SimulatedBench(table)
 
 
 def open_lego_arm(arguments: argparse.Namespace, geometry: Geometry, *, start_s: float = 0.0) -> LegoArm:

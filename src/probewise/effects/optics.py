@@ -484,10 +484,8 @@ def edge_shadow_of_patterns(kind: LightEffect, of: Extent, patterns: tuple[str, 
     looks = f"within {{1}} mm {where} the surface looks {{|0|}} % {{darker/brighter}} than the pattern explains"
     says = in_words(f"{looks}: the edge {{casts a shadow/reflects light}}", factors=(100,))
     parameters: Declared = {"amp": (AMPLITUDE, "1"), "w": (widths, "mm")}
-    bank, source = (
-        single_column_bank(1.0, sizes_inside(widths, 6)),
-        partial(edge_shadow_of_patterns, kind, of, patterns),
-    )
+    bank = single_column_bank(1.0, sizes_inside(widths, 6))
+    source = partial(edge_shadow_of_patterns, kind, of, patterns)
     return kind.bind(of, parameters, act, says, bank, typical=0.01, patterns=patterns, source=source)
 
 

@@ -30,8 +30,7 @@ from probewise.experiment import (
 )
 from probewise.experiment.result import WRONG_MM, stop_reason_with_checks
 from probewise.report import html
-from probewise.report.plots.canvas import PAGE_IN, AxesGrid, axes_of_frame, grid_of_axes, png
-from probewise.report.plots.canvas import frame_png as render_frame
+from probewise.report.plots.canvas import PAGE_IN, AxesGrid, axes_of_frame, grid_of_axes, png, rendered_frame
 from probewise.report.plots.probabilities import effect_probabilities_by_reading
 from probewise.report.plots.search import draw_field_legend, information_gained, playing_field, posterior_widths
 from probewise.report.words import (
@@ -100,7 +99,7 @@ def robot_view_png(
     ax = axes_of_frame()
     draw_robot_view(step, experiment, readings, levels=levels, truth_mm=truth_mm, ax=ax)
     draw_field_legend(ax)
-    return render_frame(ax)
+    return rendered_frame(ax)
 
 
 def draw_view_after(run: Exploration, number: int, *, title: str = "", ax: Axes | None = None) -> Axes:

@@ -74,9 +74,8 @@ OUT_OF_REACH = "#d9d9d9"
 """Colour of places out of the arm's reach, in every drawing of the field."""
 
 _OPENED: WeakSet[Figure] = WeakSet()  # figures that plot functions opened: `png` closes them, and no others
-_STILL: WeakKeyDictionary[Figure, tuple[Any, Any, Any]] = (
-    WeakKeyDictionary()
-)  # canvas of frames, what stays, and of what
+# Of the figure of frames: its canvas, what stays, and of what.
+_STILL: WeakKeyDictionary[Figure, tuple[Any, Any, Any]] = WeakKeyDictionary()
 _COLUMNS: WeakKeyDictionary[Legend, int] = WeakKeyDictionary()  # of legends above axes, or below all of a figure
 
 # The paper's copper tones. They start above black, so that black squares and blue outlines stay visible, and lightness
@@ -234,7 +233,7 @@ def axes_of_frame() -> Axes:
     return Figure((8.4, 4.7), dpi=90).add_axes((0.09, 0.24, 0.77, 0.69))
 
 
-def frame_png(ax: Axes) -> bytes:
+def rendered_frame(ax: Axes) -> bytes:
     """Render the axes of a frame as PNG; both axis labels with their ticks, and the legend, are drawn once for all."""
     sheet, inside = figure_of(ax), (ax.images, ax.collections, ax.lines, ax.patches, ax.spines.values(), ax.child_axes)
     (title,) = (text for text in ax.get_children() if isinstance(text, Text) and text.get_text())

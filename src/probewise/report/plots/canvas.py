@@ -74,8 +74,8 @@ OUT_OF_REACH = "#d9d9d9"
 """Colour of places out of the arm's reach, in every drawing of the field."""
 
 _OPENED: WeakSet[Figure] = WeakSet()  # figures that plot functions opened: `png` closes them, and no others
-# Of the figure of frames: its canvas, what stays, and of what.
-_STILL: WeakKeyDictionary[Figure, tuple[Any, Any, Any]] = WeakKeyDictionary()
+# Of the figure of frames: what stays, and of what. Its canvas would keep the figure here for ever.
+_STILL: WeakKeyDictionary[Figure, tuple[Any, Any]] = WeakKeyDictionary()
 _COLUMNS: WeakKeyDictionary[Legend, int] = WeakKeyDictionary()  # of legends above axes, or below all of a figure
 
 # The paper's copper tones. They start above black, so that black squares and blue outlines stay visible, and lightness
@@ -240,7 +240,8 @@ def rendered_frame(ax: Axes) -> bytes:
     moving = sorted([title, *itertools.chain(*inside)], key=lambda artist: artist.get_zorder())
     labels = [text.get_text() for legend in sheet.legends for text in legend.get_texts()]
     still = [*labels, *ax.get_xlim(), *ax.get_ylim()]
-    agg, region, drawn = _STILL.get(sheet, (FigureCanvasAgg(sheet), None, None))
+    agg: Any = sheet.canvas if isinstance(sheet.canvas, FigureCanvasAgg) else FigureCanvasAgg(sheet)
+    region, drawn = _STILL.get(sheet, (None, None))
     if drawn != still:
         try:
             for artist in moving:
@@ -250,7 +251,7 @@ def rendered_frame(ax: Axes) -> bytes:
         finally:
             for artist in moving:
                 artist.set_visible(True)
-        _STILL[sheet] = agg, region, _ = agg, agg.copy_from_bbox(sheet.bbox), still
+        _STILL[sheet] = region, _ = agg.copy_from_bbox(sheet.bbox), still
     agg.restore_region(region)
     for artist in moving:
         artist.draw(agg.get_renderer())

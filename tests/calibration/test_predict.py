@@ -116,7 +116,7 @@ def test_a_sensor_file_of_before_counts_from_0(make_sensor):
     document = json.loads(replace(drifting, origins={"offset_drift": Origin(time_s=3.0)}).to_json())
     document.pop("origins")
     (of_before,) = FittedSensor.from_json(json.dumps(document)).effects_on_new_scans
-    assert of_before.where.origin == Origin()
+    assert of_before.binding.where.origin == Origin()
     for damaged in ({"time_s": "noon"}, {"hours": 3.0}, 3):
         with pytest.raises(FileError):
             FittedSensor.from_json(json.dumps(document | {"origins": {"offset_drift": damaged}}))

@@ -17,11 +17,12 @@ from probewise.diagnosis.light_sensor import LightSensorApparatus
 from probewise.diagnosis.locate import Place
 from probewise.diagnosis.noise import white_noise
 from probewise.diagnosis.prepared import Prepared, rows_to_diagnose
+from probewise.effects.effect import Binding
 from probewise.recordings import Plan, Recording, Uniform
 
 LAG = SimpleNamespace(
     name="lag",
-    counted_from="",
+    binding=Binding(),
     covariates=("time",),
     amplitudes=(),
     sentence=lambda mean, sd: f"it lags by {mean[0]:.0f} s",

@@ -68,4 +68,4 @@ def test_effects_of_a_sensor_from_far_away_count_from_0_in_a_run():
     )
     (kept,) = sensor.effects_on_new_scans
     (of_run,) = experiment_for(sensor, Circle(), Field(), trust=1.0).model.effects
-    assert (kept.where.origin, of_run.effect.where.origin) == (Origin(time_s=1.7e9), Origin())
+    assert (kept.binding.where.origin, of_run.effect.binding.where.origin) == (Origin(time_s=1.7e9), Origin())

@@ -369,7 +369,7 @@ def test_an_effect_found_in_a_run_counts_from_0_beside_one_from_far_away(sensor,
     )
     mended = repaired_sensor(far, leading(stepped[-1], "ambient_gradient"), rng=np.random.default_rng(1))
     mended = type(sensor).from_json(mended.to_json())
-    assert {e.name: e.where.origin.x_mm for e in mended.effects_on_new_scans} == {
+    assert {e.name: e.binding.where.origin.x_mm for e in mended.effects_on_new_scans} == {
         "position_scale": 2000.0,
         "ambient_gradient": 0.0,
     }

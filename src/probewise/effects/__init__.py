@@ -81,7 +81,7 @@ EFFECTS: Mapping[str, LightEffect] = MappingProxyType({**VOCABULARY, **RARE_EFFE
 """Every effect that has a formula here, by name, in the vocabulary or out of it."""
 
 OTHER_FORMS: Mapping[tuple[str, str], LightEffect] = MappingProxyType({("backlash", "of each axis"): pose.play_of_axes})
-"""Other formulas of effects in the vocabulary, by name and `Effect.form`."""
+"""Other formulas of effects in the vocabulary, by name and `Binding.form`."""
 
 PROPOSAL = "formula:"
 """Prefix of the names of formulas that are proposed for a residual which no named effect explains."""

@@ -83,7 +83,22 @@ class Where:
     patterns: tuple[str, ...] = ()
 
 
-EVERYWHERE = Where()  # on all scans and patterns, counting from 0
+@dataclass(frozen=True)
+class Binding:
+    """How an effect is bound to a recording.
+
+    `counted_from`: from where it counts a time, a place or a column, in words; "" for 0, or if it does not count. Of a
+    light sensor's effect: `where` it acts; which of several formulas it has (`form`); and a function that builds one
+    with the same `apply` and `sentence` (`source`), by which a pickled effect finds them again.
+    """
+
+    counted_from: str = ""
+    where: Where = Where()
+    form: str = ""
+    source: Callable[[], Effect] | None = None
+
+
+UNBOUND = Binding()
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,15 +124,12 @@ class Effect:
         Parameter values, by index, at which it has no effect, if these are not zero amplitudes.
     alternatives
         Mutually exclusive variants of it, with other priors and entries; it itself is another variant.
-    counted_from
-        From where it counts a time, a place or a column, in words; "" for 0, or if it does not count.
     expression
         Formula of a proposal, which has no name in the vocabulary; otherwise empty.
     needs_rising_time
         Whether it looks back to earlier times of a run, which time must then not fall within.
-    where, form, source
-        Of a light sensor's effect: origin, scans, patterns; which of several formulas it has; and a function that
-        builds one with the same `apply` and `sentence`, by which a pickled effect finds them again.
+    binding
+        From where it counts, and of a light sensor's effect where it acts and how it is built.
     """
 
     name: str
@@ -131,12 +143,9 @@ class Effect:
     amplitudes: tuple[int, ...] = (0,)
     absent: Mapping[int, float] = field(default_factory=dict)
     alternatives: tuple[Effect, ...] = ()
-    counted_from: str = ""
     expression: str = ""
     needs_rising_time: bool = False
-    where: Where = EVERYWHERE
-    form: str = ""
-    source: Callable[[], Effect] | None = None
+    binding: Binding = UNBOUND
 
     has_change_point: ClassVar[bool] = False
     """Whether its variants are the intervals of a change point."""
@@ -173,7 +182,7 @@ class Effect:
 
     def __reduce__(self) -> tuple[Callable[..., Effect], tuple[Any, ...]]:
         state = {each.name: getattr(self, each.name) for each in fields(self)}
-        if self.source is not None:
+        if self.binding.source is not None:
             del state["apply"], state["sentence"]
         return _restored_effect, (type(self), state)
 
@@ -190,12 +199,12 @@ class Effect:
     @property
     def scans(self) -> tuple[str, ...]:
         """Names of the scans that it is restricted to; () for all."""
-        return self.where.scans
+        return self.binding.where.scans
 
     @property
     def patterns(self) -> tuple[str, ...]:
         """Names of the patterns that it is restricted to; () for all."""
-        return self.where.patterns
+        return self.binding.where.patterns
 
     @property
     def fixed(self) -> tuple[str, ...]:
@@ -255,7 +264,7 @@ class Effect:
 
 
 def _restored_effect(kind: type[Effect], state: dict[str, Any]) -> Effect:
-    source = state["source"]
+    source = state["binding"].source
     made = None if source is None else source()
     return kind(**state) if made is None else kind(**state, apply=made.apply, sentence=made.sentence)
 
@@ -400,6 +409,7 @@ class LightEffect:
         kind: type[Effect] = Effect,
         scans: tuple[str, ...] = (),
         patterns: tuple[str, ...] = (),
+        source: Callable[[], Effect] | None = None,
         **more: Any,
     ) -> Effect:
         """Return `Effect.declared` of amplitudes of a typical size, counting from the origin if it counts."""
@@ -408,8 +418,8 @@ class LightEffect:
             counted_from = f"time counts from {at.time_s:.12g} s"
         elif self.counts == "place" and (at.x_mm or at.y_mm):
             counted_from = f"X and Y count from ({at.x_mm:g}, {at.y_mm:g}) mm"
-        own = {"counted_from": counted_from, "where": Where(at, scans, patterns)}
-        more = {**own, "source": partial(_effect_there, self, of, scans), **more}
+        source = source or partial(_effect_there, self, of, scans)
+        more["binding"] = Binding(counted_from, Where(at, scans, patterns), source=source)
         effect = kind.declared(self.name, self.stage, parameters, self.covariates, act, says, entries, **more)
         return effect if typical is None else effect.of_typical_size(typical)
 
@@ -525,7 +535,8 @@ def sentence_from_samples(effect: Effect, samples: FloatArray) -> str:
             between = f"between {low:.2g} and {high:.2g} {unit_after_number(effect.units[k])}".rstrip()
             name = "size" if effect.prior.names[k] == "a" else f"size {effect.prior.names[k]}"
             sentence += f"; its {name} may have either sign, {between} (95 %)"
-    return f"{sentence} ({effect.counted_from})" if effect.counted_from else sentence
+    counted_from = effect.binding.counted_from
+    return f"{sentence} ({counted_from})" if counted_from else sentence
 
 
 def in_words(text: str, *units: str, factors: Sequence[float] = ()) -> Say:

@@ -81,7 +81,8 @@ def play_of_axes(kind: LightEffect, of: Extent) -> Effect:
         sides = sign_of_change(np.stack([plan.x_mm, plan.y_mm]), plan.rows_by_scan(), still=_STILL_MM)
         return _moved(value, *(-(theta[:, :1] / 2) * side for side in sides))
 
-    return replace(cast(Effect, backlash.build(kind, of)), apply=act, form="of each axis")
+    along_motion = cast(Effect, backlash.build(kind, of))
+    return replace(along_motion, apply=act, binding=replace(along_motion.binding, form="of each axis"))
 
 
 @light_effect("position_scale", Stage.POSE, "a wrong scale of the positions", ("place", "slope"), counts="place")

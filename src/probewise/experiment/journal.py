@@ -341,7 +341,7 @@ def _digested(value: object) -> Iterator[bytes]:
     """Yield types, names of fields and bits of a value, to be digested."""
     if isinstance(value, Effect):
         yield _EFFECT
-        yield from _digested((value.name, None if isinstance(value, NoiseEffect) else value.where))
+        yield from _digested((value.name, None if isinstance(value, NoiseEffect) else value.binding.where))
     elif dataclasses.is_dataclass(value) and not isinstance(value, type):
         yield f"<{type(value).__qualname__}>".encode()
         for item in dataclasses.fields(value):

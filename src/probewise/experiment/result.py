@@ -469,6 +469,6 @@ def repaired_sensor(sensor: FittedSensor, last: Step, *, rng: np.random.Generato
         names=(*sensor.names, *(f"{name}.{parameter}" for parameter in parameters)),
         samples=np.concatenate([sensor.samples, own], axis=1),
         effects=(*sensor.effects, name),
-        forms={**sensor.forms, **({name: form} if (form := effect.form) else {})},
+        forms={**sensor.forms, **({name: form} if (form := effect.binding.form) else {})},
         notes=(*sensor.notes, note),
     )

@@ -249,7 +249,7 @@ def in_paced_time(effect: Effect) -> Effect:
         time_s = paced_time_s(plan)
         return np.asarray(effect.apply(value, theta, plan if time_s is None else replace(plan, time_s=time_s)))
 
-    return replace(effect, apply=act, source=partial(in_paced_time, effect))
+    return replace(effect, apply=act, binding=replace(effect.binding, source=partial(in_paced_time, effect)))
 
 
 def from_rest(effect: Effect) -> Effect:
@@ -265,7 +265,7 @@ def from_rest(effect: Effect) -> Effect:
         x_mm, y_mm = np.where(first, value.x_mm, moved.x_mm), np.where(first, value.y_mm, moved.y_mm)
         return replace(moved, x_mm=x_mm, y_mm=y_mm)
 
-    return replace(effect, apply=act, source=partial(from_rest, effect))
+    return replace(effect, apply=act, binding=replace(effect.binding, source=partial(from_rest, effect)))
 
 
 @dataclass(frozen=True)

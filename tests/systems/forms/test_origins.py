@@ -110,8 +110,8 @@ def test_what_counts_from_a_far_time_says_so_and_nothing_else_does(how, name):
     setting = near[name].entries[:1, 0]
     plain = sentence_from_samples(near[name], setting)
     assert sentence_from_samples(later[name], setting) == f"{plain} (t_s counts from 1700000000 s)"
-    assert not [each for each, form in near.items() if form.counted_from]
-    counting = {name_without_copy_suffix(each) for each, form in later.items() if form.counted_from}
+    assert not [each for each, form in near.items() if form.binding.counted_from]
+    counting = {name_without_copy_suffix(each) for each, form in later.items() if form.binding.counted_from}
     assert counting <= set(COUNTS_TIME)
 
 

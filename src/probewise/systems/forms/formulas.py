@@ -19,6 +19,7 @@ from probewise.effects.effect import (
     AMPLITUDE,
     PHASE,
     POSITIVE,
+    Binding,
     ChangePoints,
     Declared,
     Effect,
@@ -316,7 +317,7 @@ def _square_wave_form(about: ReferenceFit) -> Iterator[Effect]:
         change,
         ("time",),
         single_column_bank(*(each.ravel() for each in grid)),
-        counted_from=origin_in_words(table.time, origin, about.time_unit),
+        binding=Binding(origin_in_words(table.time, origin, about.time_unit)),
     )
 
 

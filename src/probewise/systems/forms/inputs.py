@@ -15,6 +15,7 @@ from probewise.effects.effect import (
     PHASE,
     POSITIVE,
     Act,
+    Binding,
     Declared,
     Effect,
     Fixed,
@@ -69,7 +70,7 @@ def forms_on_inputs(about: ReferenceFit) -> Iterator[Effect]:
         act = _column_changer(time, acting(lambda c, rows, a: origin + (c - origin) * (1 + a)))
         says = in_words("the true time is the recorded time times (1 + a), a = {0}")
         own = ("clock_drift", Stage.INPUT, {"a": (AMPLITUDE, "1")}, ("time",), act, says)
-        yield from about.form(*own, guess=1e-5, counted_from=origin_in_words(time, origin, about.time_unit))
+        yield from about.form(*own, guess=1e-5, binding=Binding(origin_in_words(time, origin, about.time_unit)))
 
 
 def _forms_on_column(about: ReferenceFit, name: str) -> Iterator[Effect]:
@@ -137,9 +138,9 @@ def _periodic_error_form(about: ReferenceFit, name: str) -> Iterator[Effect]:
     both = "an amplitude of {0} and a period of {1}, both in units of"
     says, bank = f"{name} has a periodic error with {both} {name}", sine_and_cosine_entries(1.0, 1 / frequencies)
     own = (parameters, (covariate_of_column(name),), _column_changer(name, wave), in_words(says), bank)
-    guess, counted_from = 1e-4 * float(np.std(values)), origin_in_words(name, origin)
+    guess, binding = 1e-4 * float(np.std(values)), Binding(origin_in_words(name, origin))
     given = (f"periodic_error:{name}", Stage.INPUT, *own)
-    yield from about.form(*given, guess=guess, kind=WaveEffect, counted_from=counted_from)
+    yield from about.form(*given, guess=guess, kind=WaveEffect, binding=binding)
 
 
 @within_runs

@@ -16,6 +16,7 @@ from probewise.effects.effect import (
     MOST_FREQUENCIES,
     PHASE,
     POSITIVE,
+    Binding,
     ChangePoints,
     Declared,
     Effect,
@@ -217,7 +218,7 @@ def drift_form(about: ReferenceFit, name: str, of: Quantity) -> Iterator[Effect]
         return np.asarray(theta[:, :1] * along)
 
     size: Declared = {"a": (AMPLITUDE, f"{of.unit or '1'}/{per}")}
-    more: dict[str, Any] = {"counted_from": origin_in_words(table.time, origin, per)}
+    more: dict[str, Any] = {"binding": Binding(origin_in_words(table.time, origin, per))}
     variants = list[Effect]()
     if not follow_each_other:
         variants += of.varying(about, name, at_rows, size, ("time",), says, **more)
@@ -321,7 +322,7 @@ def declared_wave(about: ReferenceFit, frequencies: FloatArray, unit: str, highe
         "covariates": ("time",),
         "entries": sine_and_cosine_entries(1.0, frequencies),
         "kind": WaveEffect,
-        "counted_from": origin_in_words(table.time, origin_of_column(table.time_s), time_unit),
+        "binding": Binding(origin_in_words(table.time, origin_of_column(table.time_s), time_unit)),
     }
 
 

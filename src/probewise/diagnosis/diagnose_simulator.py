@@ -602,8 +602,7 @@ def prepare_system(
     misfit = float(np.sqrt(np.mean(found.residuals**2))) / sd
     conflicts = tuple(notes_on_prior_conflict(system, found, white_noise_of_recording(recording)))
     apparatus = SimulatorApparatus(ReferenceFit(system, table, found.z, sd, misfit=misfit), tuple(left_out))
-    sorting = sorting_column(apparatus.about)
-    if sorting is not None:
+    if (sorting := sorting_column(apparatus.about)) is not None:
         told_of = f"what jumps or wanders from row to row may change with {sorting} instead"
         conflicts = (*conflicts, f"rows are sorted by {sorting}: {told_of}")
     recording = replace(recording, notes=(*recording.notes, *conflicts))

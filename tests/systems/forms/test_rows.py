@@ -91,7 +91,9 @@ def _prepared(x=_X, *, time=None, **more):
 
 def test_only_a_column_that_drives_the_simulator_sorts_a_table_without_a_time():
     number = np.arange(50.0)
-    assert sorting_column(_prepared().apparatus.about) == "x"
+    about = _prepared().apparatus.about
+    assert sorting_column(about) == "x"
+    assert not any("sum over rows" in form.name for form in formula_forms(about))
     assert sorting_column(_prepared(_X[::-1]).apparatus.about) == "x"
     assert sorting_column(_prepared(_RNG.permutation(_X), number=number).apparatus.about) is None
     assert sorting_column(_prepared(time="t", t=number).apparatus.about) is None

@@ -17,7 +17,7 @@ from probewise.effects.effect import Effect, StepEffect, WaveEffect
 from probewise.errors import require
 from probewise.priors import LogUniform
 from probewise.systems.forms.formulas import formula_forms
-from probewise.systems.forms.inputs import driving_columns, forms_on_inputs, forms_on_rates
+from probewise.systems.forms.inputs import driving_columns, forms_on_inputs, forms_on_rates, sorting_column
 from probewise.systems.forms.modulations import forms_of_extras, forms_on_parameters
 from probewise.systems.forms.readings import forms_on_readings
 from probewise.systems.forms.reference import ReferenceFit, StoredFit
@@ -25,7 +25,7 @@ from probewise.systems.simulator import Simulator
 from probewise.systems.system import System
 from probewise.systems.table import covariate_of_column
 
-__all__ = ["WORDS", "ReferenceFit", "StoredFit", "bind_forms", "driving_columns"]
+__all__ = ["WORDS", "ReferenceFit", "StoredFit", "bind_forms", "driving_columns", "sorting_column"]
 
 WORDS: Mapping[str, str] = MappingProxyType(
     {
@@ -89,20 +89,6 @@ def _second_wave(form: Effect) -> Effect:
     shorter = replace(period, high=max(0.5 * period.high, 1.1 * period.low))
     entries = form.entries[form.entries[:, 0, 1] < shorter.high]
     return replace(again, parameters={**form.marginals, "period": shorter}, entries=entries)
-
-
-def sorting_column(about: ReferenceFit) -> str | None:
-    """Return the name of a column that drives the simulator and rises or falls along all rows; None if none does.
-
-    Where a time was recorded, there is none: rows are in its order, whatever they are sorted by besides. A column that
-    drives nothing, such as a number of the reading, may be that order itself.
-    """
-    table = about.table
-    if table.has_varying_time:
-        return None
-    changes = {name: np.diff(values) for name, values in table.covariates.items() if np.ptp(values) > 0}
-    ordered = {name for name, change in changes.items() if np.all(change >= 0) or np.all(change <= 0)}
-    return next((name for name in driving_columns(about) if name in ordered), None) if ordered else None
 
 
 def names_of_jumps_in_sorted_rows(effects: Mapping[str, Any]) -> frozenset[str]:

@@ -32,7 +32,7 @@ from probewise.effects.effect import (
 )
 from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
-from probewise.systems.forms.inputs import trial_rate
+from probewise.systems.forms.inputs import sorting_column, trial_rate
 from probewise.systems.forms.modulations import (
     frequency_prior,
     origin_in_words,
@@ -372,8 +372,8 @@ def _varying_influence_form(about: ReferenceFit, name: str, values: FloatArray) 
 def _dose_forms(about: ReferenceFit, name: str, values: FloatArray) -> Iterator[Effect]:
     """Yield changes of the reading that saturate with a dose: the integral of |column - mean|, or |column|."""
     table, centre, in_time = about.table, _rounded_mean(values), about.table.has_varying_time
-    if not in_time and not about.rows_are_in_order:
-        return
+    if not in_time and (not about.rows_are_in_order or sorting_column(about) is not None):
+        return  # what adds up along sorted rows is a function of the column that sorts them
     origins = {f"|{name} - {text_rounded_to_spread(centre, float(np.std(values)))}|": centre}
     if values.min() >= 0 or values.max() <= 0:
         origins[f"|{name}|"] = 0.0

@@ -60,6 +60,20 @@ def driving_columns(about: ReferenceFit) -> list[str]:
     return out
 
 
+def sorting_column(about: ReferenceFit) -> str | None:
+    """Return the name of a column that drives the simulator and rises or falls along all rows; None if none does.
+
+    Where a time was recorded, there is none: rows are in its order, whatever they are sorted by besides. A column that
+    drives nothing, such as a number of the reading, may be that order itself.
+    """
+    table = about.table
+    if table.has_varying_time:
+        return None
+    changes = {name: np.diff(values) for name, values in table.covariates.items() if np.ptp(values) > 0}
+    ordered = {name for name, change in changes.items() if np.all(change >= 0) or np.all(change <= 0)}
+    return next((name for name in driving_columns(about) if name in ordered), None) if ordered else None
+
+
 def forms_on_inputs(about: ReferenceFit) -> Iterator[Effect]:
     """Yield a form for each possible error of the columns that drive the simulator, and of the clock."""
     for name in driving_columns(about):

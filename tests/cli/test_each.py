@@ -2,6 +2,7 @@
 
 import csv
 import os
+import subprocess
 import sys
 import threading
 
@@ -85,6 +86,14 @@ def test_a_process_that_dies_is_said_in_words():
     """As one that the system ends for want of memory."""
     with pytest.raises(NotConvergedError, match="a worker process has died"), worker_pool(1) as pool:
         pool.submit(os._exit, 1).result()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGKILL")
+def test_the_processes_of_a_killed_command_end_with_it():
+    """They hold its standard output, which would stay open."""
+    use = "import os\nfrom probewise.cli._executor import worker_pool\nwith worker_pool(2) as pool:\n"
+    killed = f"{use}    pool.submit(os.getpid).result()\n    os.kill(os.getpid(), 9)"
+    assert subprocess.run([sys.executable, "-c", killed], stdout=subprocess.PIPE, timeout=60).returncode == -9
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no pipes with names")

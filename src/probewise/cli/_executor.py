@@ -117,5 +117,14 @@ def _start_tracker_without_hangups() -> None:
 
 
 def _initialise_worker() -> None:
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # end at once on Ctrl-C; the command reports what was kept
     warnings.simplefilter("ignore", DoubtfulResultWarning)  # the results hold the warnings, and the report shows them
+
+
+def _end_with_parent() -> None:
+    """End this process once its parent is gone, though killed: a pool's processes would wait for tasks for ever."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)

@@ -20,7 +20,7 @@ from probewise.investigation import (
     parse_concealed,
     reason_if_settled,
 )
-from probewise.recordings import Instrumentation, Recording, paper_plan
+from probewise.recordings import Instrumentation, Recording, paper_plan, write_recording
 from probewise.world import World
 from probewise.world.concealed import backlash, lag, saturation
 from probewise.world.shipped import BLOB, true_world
@@ -218,6 +218,16 @@ def test_a_plan_that_was_written_decides(tmp_path):
     first = folder.record_round(1, scans(0), "", take=TAKE)
     other = scans(0).take(np.arange(3))
     np.testing.assert_array_equal(folder.record_round(1, other, "", take=TAKE).readings, first.readings)
+
+
+@pytest.mark.parametrize("rows", [range(100, -1, -1), [*range(101), 5], [101, 102]], ids=["turned", "more", "scan 1"])
+def test_readings_of_another_plan_than_their_round_s_are_refused(rows, tmp_path):
+    folder = RoundsFolder(tmp_path / "rounds", {"seed": 1}, resume=False)
+    folder.record_round(1, scans(0), "", take=TAKE)
+    plan = scans(0, 1).take([*rows])
+    write_recording(Recording(plan, np.full(len(plan), 20.0)), tmp_path / "rounds" / "1.csv")
+    with pytest.raises(FileError, match="readings of another plan"):
+        folder.record_round(1, scans(0), "", take=TAKE)
 
 
 def test_two_investigations_do_not_mix(tmp_path):

@@ -22,6 +22,7 @@ from probewise._arrays import own_arithmetic
 from probewise._display import Reported
 from probewise._kinds import checked_number, checked_whole, require_accepts, require_kind, require_rng
 from probewise.arm import Reading, readings_of_recording, recording_of_readings
+from probewise.arm.carry_out import readings_begun_with
 from probewise.diagnosis import SETTLED, Diagnosis, SensorPrior, diagnose
 from probewise.diagnosis.words import hypothesis_in_words
 from probewise.effects import VOCABULARY, LightEffect
@@ -265,6 +266,7 @@ class RoundsFolder:
         """Take the readings of a round, or those still missing, write them to the folder, and return all of them.
 
         A plan of the round that is in the folder already is used in place of `plan`; `asked` is the plan in words.
+        FileError if the readings there are not of its first rows.
         """
         planned, readings_file = self.path / f"{number}_plan.csv", self.path / f"{number}.csv"
         if not planned.exists():
@@ -274,7 +276,7 @@ class RoundsFolder:
                 write_text_atomically(self.path / _SETTINGS, text)
             write_plan(plan, planned)
         plan = read_plan(planned)
-        readings = readings_of_recording(read_recording(readings_file)) if readings_file.exists() else []
+        readings = readings_begun_with(plan, readings_file) if readings_file.exists() else []
         kept_s = time.monotonic()
         progress(f"round {number}, readings", len(readings), len(plan))
         try:

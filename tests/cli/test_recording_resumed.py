@@ -129,3 +129,13 @@ def test_a_plan_where_the_recording_should_be_is_refused(record, tmp_path, capsy
     write_plan(plan(), tmp_path / "r.csv")
     assert record(plan(), "--resume") == 2
     assert "no column of readings: this is a plan" in capsys.readouterr().err
+
+
+def test_a_session_begun_while_another_records_is_refused_and_loses_no_reading(record, tmp_path, capsys):
+    again = """from probewise.cli import main
+        if self.n in (1, 3): main([{words}] + ["--resume"] * (self.n > 1))
+        return float(self.n)"""
+    words = "arm", "record", tmp_path / "plans" / "plan.csv", "--out", tmp_path / "r.csv", "--arm", tmp_path / "own.py"
+    assert record(plan(), more=again.format(words=", ".join(repr(str(word)) for word in words))) == 0
+    assert capsys.readouterr().err.count("r.csv: another process is writing to it; allowed: one process at a time") == 2
+    np.testing.assert_array_equal(read_recording(tmp_path / "r.csv").readings, [1, 2, 3, 4])

@@ -6,23 +6,29 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise.arm.geometry import wrapped_to_pi
 from probewise.arm.instrument import Instrument, Pose, Reading, require_within_reach
 from probewise.arm.lego import LegoArm
 from probewise.arm.own import Measures, OwnInstrument, as_instrument
 from probewise.arm.simulated import SimulatedArm
-from probewise.errors import ParameterError
-from probewise.recordings.patterns import Pattern, Uniform, where_white_in_words
+from probewise.errors import FileError, ParameterError, shown
+from probewise.recordings import read_plan_and_readings
+from probewise.recordings.patterns import Pattern, Uniform, have_same_albedo, where_white_in_words
 from probewise.recordings.plan import Instrumentation, Plan, Recording
 
 QUARTER_RAD = math.pi / 2  # a LEGO mount turns by right angles
 _SAME_TURN_RAD = math.radians(0.5)
 BY_HAND_S = 30.0  # to lay a sheet or to turn the sensor
 PATTERN = "field"  # under readings of no plan
+_OFF_PLAN_MM = 5.0  # tolerance, since a user's own instrument may report the true place
+_OFF_PLAN_RAD = math.radians(5.0)  # and the true orientation
+_LEGO_OFF_PLAN_RAD = math.radians(47.0)  # a LEGO mount turns by right angles, so that up to 45 degrees are left
 
 
 @dataclass(frozen=True)
@@ -196,6 +202,50 @@ def readings_of_recording(recording: Recording) -> list[Reading]:
         )
         for k, value in enumerate(recording.readings)
     ]
+
+
+def read_unfinished_recording(path: Path) -> Recording:
+    """Read the recording of an earlier session, all of whose readings may be missing; FileError if it is a plan."""
+    plan, readings = read_plan_and_readings(path)
+    if readings is None:
+        raise FileError(path, "no column of readings: this is a plan", "a recording, or another --out")
+    return Recording(plan, readings, str(path))
+
+
+def readings_begun_with(plan: Plan, path: Path, *, is_lego: bool = True) -> list[Reading]:
+    """List the readings in the recording of an earlier session; FileError if they are not of this plan's first rows."""
+    before = read_unfinished_recording(path)
+    difference = next(_differences(before.plan, plan, _LEGO_OFF_PLAN_RAD if is_lego else _OFF_PLAN_RAD), None)
+    if difference is not None:
+        raise FileError(path, difference, "the plan and options of the session that began it; or another --out")
+    return readings_of_recording(before)
+
+
+def _differences(before: Plan, plan: Plan, off_rad: float) -> Iterator[str]:
+    """Yield what differs between an earlier session's rows and this plan's first ones, one phrase each."""
+    if len(before) > len(plan):
+        yield f"readings of another plan: it has {len(before)} rows, this plan {len(plan)}"
+        return
+    first = plan.take(np.arange(len(before)))
+    names_before, names = (np.array(each.pattern_names)[each.pattern] for each in (before, first))
+    rows = {
+        "x_mm": np.abs(before.x_mm - first.x_mm) > _OFF_PLAN_MM,
+        "y_mm": np.abs(before.y_mm - first.y_mm) > _OFF_PLAN_MM,
+        "orientation": np.abs(wrapped_to_pi(before.orientation_rad - first.orientation_rad)) > off_rad,
+        "scan": before.scan != first.scan,
+        "pattern": names_before != names,
+    }
+    for name, differs in rows.items():
+        if differs.any():
+            yield f"readings of another plan: the {name} of reading {1 + int(differs.argmax())} differs"
+    for name in dict.fromkeys(names_before.tolist()):
+        there, here = before.patterns[name], plan.patterns[name]
+        if not have_same_albedo(there, here):
+            yield f"readings of another plan: pattern {name!r} is {shown(there)} there, {shown(here)} here"
+    for field in dataclasses.fields(plan.instrumentation):
+        values = [getattr(each.instrumentation, field.name) for each in (before, plan)]
+        if values[0] != values[1] and field.name != "description":
+            yield f"{field.name} is {values[0]!r} there, {values[1]!r} here"
 
 
 def _require_feasible_settings(arm: LegoArm | OwnInstrument | SimulatedArm, plan: Plan) -> None:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
+import contextlib
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,12 +24,11 @@ from probewise.arm import (
     carry_out,
     percent_to_lego_units,
     read_geometry,
-    readings_of_recording,
     recording_of_readings,
     require_within_reach,
     shipped_geometry_path,
 )
-from probewise.arm.carry_out import BY_HAND_S, duration_s
+from probewise.arm.carry_out import BY_HAND_S, duration_s, read_unfinished_recording, readings_begun_with
 from probewise.arm.fitting import (
     LEAST_P,
     check_heights,
@@ -37,7 +37,7 @@ from probewise.arm.fitting import (
     spread_mark_places,
     write_marks,
 )
-from probewise.arm.geometry import JOINTS, wrapped_to_pi
+from probewise.arm.geometry import JOINTS
 from probewise.arm.geometry_file import text_with_fitted_values
 from probewise.arm.nxt import percent_from_counts
 from probewise.calibration import read_sensor
@@ -45,18 +45,16 @@ from probewise.cli import _bench
 from probewise.cli._common import CommandError, message_to_resume, print_result, print_warning, progress_of, say
 from probewise.cli._inputs import read_or_shipped_geometry, read_or_shipped_plan
 from probewise.cli._options import SHIPPED, parse_finite_numbers, parse_place, refuse_options
-from probewise.errors import FileError, LinkError, ParameterError, ReachError, require, shown
+from probewise.errors import FileError, LinkError, ParameterError, ReachError, require
 from probewise.recordings import (
     Pattern,
     Plan,
-    Recording,
-    read_plan_and_readings,
+    hold_lock,
     write_bytes_atomically,
     write_recording,
     write_text_atomically,
 )
 from probewise.recordings.files import pictures_to_write
-from probewise.recordings.patterns import have_same_albedo
 from probewise.scene import region_of
 
 _UNITS = "LEGO units (1 dark to 100 bright)"
@@ -66,9 +64,6 @@ _HEIGHTS, _APART_MM = 9, 1.0  # at which the light is learnt, from that of readi
 _STEP_OF_LIGHT = 0.1  # of a reading in all its steps, 0 to 100
 STEP_MM = 5.0
 _MOST_MM = 60.0  # largest step
-_OFF_PLAN_MM = 5.0  # tolerance, since a user's own instrument may report the true place
-_OFF_PLAN_RAD = math.radians(5.0)  # and the true orientation
-_LEGO_OFF_PLAN_RAD = math.radians(47.0)  # a LEGO mount turns by right angles, so that up to 45 degrees are left
 
 _SEES_MM = 14.0  # radius of the sensor's view
 _LEAST_CONTRAST = 0.05  # least contrast of white and black, as a share of the larger
@@ -325,7 +320,7 @@ def _touch_and_save_marks(arguments: argparse.Namespace, geometry: Geometry, kep
     assert isinstance(instrument, LegoArm)
 
     kept_message = partial(message_to_resume, kept, taken.__len__, "mark", arguments, "--resume")
-    with reporting_what_is_kept(kept_message), instrument as arm:
+    with reporting_what_is_kept(kept_message), hold_lock(kept), instrument as arm:
         answer, tell = _bench.prompter_for_answer(arm), print_result if bench is None else lambda text: None
         if bench is None:
             _bench.prompter(arm)(
@@ -407,18 +402,21 @@ def _record_plan(arguments: argparse.Namespace, geometry: Geometry) -> None:
     origin = _bench.origin_of_plan(arguments, geometry, is_own=is_own)
     at_end = is_device_or_pipe(out)  # which takes the recording once
     taken: list[Reading] = []
+    unshared: AbstractContextManager[None] = contextlib.nullcontext()
     if not arguments.dry_run and not at_end:
         taken = _earlier_readings(out, plan, resume=arguments.resume, is_lego=chosen is None or chosen.is_lego)
+        out.parent.mkdir(parents=True, exist_ok=True)
+        unshared = hold_lock(out)
 
     def kept_message() -> str:
         if at_end:
             return f"nothing was kept: {out} takes whole recordings"
-        resume = partial(message_to_resume, out, lambda: len(_read_unfinished_recording(out)), "reading")
+        resume = partial(message_to_resume, out, lambda: len(read_unfinished_recording(out)), "reading")
         return resume(arguments, "--resume", of=len(plan))
 
     start_s = taken[-1].time_s if taken else 0.0
     instrument, bench = _bench.open_instrument(arguments, geometry, start_s=start_s, n_taken=len(taken))
-    with reporting_what_is_kept(kept_message), instrument as arm:
+    with reporting_what_is_kept(kept_message), unshared, instrument as arm:
         check = SheetCheck(plan, white_is_bright=not is_own)
         ask: Callable[[Any], None]
         if bench is not None:
@@ -459,53 +457,14 @@ def _plan_for_arm(arguments: argparse.Namespace, geometry: Geometry, *, is_own: 
     return _bench.plan_for_lego_arm(plan, geometry)
 
 
-def _read_unfinished_recording(path: Path) -> Recording:
-    """Read the recording of an earlier session, all of whose readings may be missing; FileError if it is a plan."""
-    plan, readings = read_plan_and_readings(path)
-    if readings is None:
-        raise FileError(path, "no column of readings: this is a plan", "a recording, or another --out")
-    return Recording(plan, readings, str(path))
-
-
 def _earlier_readings(out: Path, plan: Plan, *, resume: bool, is_lego: bool) -> list[Reading]:
     """List the readings of an earlier session, from `out`, which was begun with this plan; none without `resume`."""
-    if not resume:
-        for path in (out, out.with_suffix(".json"), *pictures_to_write(plan.patterns, out.parent)):
-            if path.exists():
-                raise FileError(path, "the file exists already", "--resume to continue it, or another --out")
-        return []
-    before = _read_unfinished_recording(out)
-    difference = next(_differences(before.plan, plan, _LEGO_OFF_PLAN_RAD if is_lego else _OFF_PLAN_RAD), None)
-    if difference is not None:
-        raise FileError(out, difference, "the plan and options of the session that began it; or another --out")
-    return readings_of_recording(before)
-
-
-def _differences(before: Plan, plan: Plan, off_rad: float) -> Iterator[str]:
-    """Yield what differs between an earlier session's rows and this plan's first ones, one phrase each."""
-    if len(before) > len(plan):
-        yield f"readings of another plan: it has {len(before)} rows, this plan {len(plan)}"
-        return
-    first = plan.take(np.arange(len(before)))
-    names_before, names = (np.array(each.pattern_names)[each.pattern] for each in (before, first))
-    rows = {
-        "x_mm": np.abs(before.x_mm - first.x_mm) > _OFF_PLAN_MM,
-        "y_mm": np.abs(before.y_mm - first.y_mm) > _OFF_PLAN_MM,
-        "orientation": np.abs(wrapped_to_pi(before.orientation_rad - first.orientation_rad)) > off_rad,
-        "scan": before.scan != first.scan,
-        "pattern": names_before != names,
-    }
-    for name, differs in rows.items():
-        if differs.any():
-            yield f"readings of another plan: the {name} of reading {1 + int(differs.argmax())} differs"
-    for name in dict.fromkeys(names_before.tolist()):
-        there, here = before.patterns[name], plan.patterns[name]
-        if not have_same_albedo(there, here):
-            yield f"readings of another plan: pattern {name!r} is {shown(there)} there, {shown(here)} here"
-    for field in dataclasses.fields(plan.instrumentation):
-        values = [getattr(each.instrumentation, field.name) for each in (before, plan)]
-        if values[0] != values[1] and field.name != "description":
-            yield f"{field.name} is {values[0]!r} there, {values[1]!r} here"
+    if resume:
+        return readings_begun_with(plan, out, is_lego=is_lego)
+    for path in (out, out.with_suffix(".json"), *pictures_to_write(plan.patterns, out.parent)):
+        if path.exists():
+            raise FileError(path, "the file exists already", "--resume to continue it, or another --out")
+    return []
 
 
 class SheetCheck:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from probewise._signals import reporting_what_is_kept
-from probewise._writing import Drawings, checked_output_directory
+from probewise._writing import Drawings, checked_output_directory, hold_lock
 from probewise.arm import Reading, RequestToPerson, carry_out
 from probewise.calibration import read_sensor
 from probewise.cli import _bench as benches
@@ -67,6 +67,8 @@ def run(arguments: argparse.Namespace) -> int:
             take = stack.enter_context(_opened_plan_runner(arguments, chosen, folder, seed=noise))
         else:
             take = SimulatedRecorder(world, noise)
+        out.mkdir(parents=True, exist_ok=True)
+        stack.enter_context(hold_lock(folder.path))
         progress = stack.enter_context(progress_of(arguments))
         rounds = investigate(
             partial(folder.record_round, take=take, progress=progress),

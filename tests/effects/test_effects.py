@@ -346,45 +346,6 @@ def test_a_recording_within_ten_of_its_lengths_of_0_counts_from_0(start_s, start
     assert Origin.of(plan.take([3])) == Origin()  # one reading has no length
 
 
-def test_a_shadow_falls_on_the_patterns_with_raised_edges_alone():
-    """Two-way scans of half planes, quadrants and a disc: all of the kinds, one of them, or all but one."""
-    variants = VOCABULARY["edge_shadow"].for_extent(EXTENT).variants()
-    choices = [variant.patterns for variant in variants]
-    kinds = [{type(PLAN.patterns[name]) for name in names} for names in choices]
-    assert [len(own) for own in kinds] == [0, 1, 1, 1, 2, 2, 2]
-    assert set().union(*kinds) == {HalfPlane, Quadrant, Disc}
-    plain = base().predict(np.zeros((1, 0)), PLAN)
-    theta = np.array([[0.05, 4.0]])
-
-    everywhere, *shadows = (base().with_effects(variant).predict(theta, PLAN) - plain for variant in variants)
-    for names, shadow in zip(choices[1:], shadows, strict=True):
-        inside = np.array([PLAN.pattern_names[k] in names for k in PLAN.pattern])
-        np.testing.assert_array_equal(shadow[:, ~inside], 0.0)
-        np.testing.assert_array_equal(shadow[:, inside], everywhere[:, inside])
-        assert np.abs(shadow).max() > 0.5
-    (alone,) = VOCABULARY["edge_shadow"].for_extent(Extent(10.0, 60.0, there_and_back())).variants()
-    assert alone.patterns == ()
-
-
-def between_s(step):
-    """The ends of the prior of its moment."""
-    return tuple(step.prior.from_unit_cube(np.array([[0.5, 0.0], [0.5, 1.0]]))[:, 1])
-
-
-def test_the_moments_of_a_step_lie_between_the_readings():
-    step = VOCABULARY["ambient_step"].for_extent(EXTENT)
-    ends = np.array([between_s(variant) for variant in step.variants()])
-    np.testing.assert_allclose(ends[1:, 0], ends[:-1, 1])
-    assert (ends[0, 0], ends[-1, 1]) == (PLAN.time_s.min(), PLAN.time_s.max())
-    short = VOCABULARY["ambient_step"].for_extent(Extent(0.0, 1.0, paper_plan()))
-    assert len(short.variants()) == 407
-    for variant in (short.variants()[5], short.variants()[-1]):
-        low, high = between_s(variant)
-        readings = variant.apply(np.zeros((1, 408)), np.array([[2.0, low + 0.1], [2.0, high - 0.1]]), paper_plan())
-        np.testing.assert_array_equal(readings[0], readings[1])
-        np.testing.assert_array_equal(readings[0], 2.0 * (paper_plan().time_s >= high))
-
-
 @pytest.mark.parametrize("name", ["ambient_step", "arm_knock", "gain_jump"])
 def test_gates_open_what_each_variant_acts_on(name):
     """Route one: everywhere, and the gate; route two: each variant by itself."""
@@ -458,14 +419,6 @@ def test_sine_and_cosine_join_into_amplitude_and_phase(name):
     w = 2 * np.pi * (rate if name == "flicker" else 1 / rate)
     both = entry[0, 0] * (1.2 * np.sin(w * x) - 0.5 * np.cos(w * x))
     np.testing.assert_allclose(start[0] * np.sin(w * x + start[2]), both, atol=1e-12)
-
-
-def test_frequencies_lie_close_enough_to_find_any():
-    """Half the spacing lets a wave of the whole recording slip by a quarter of a turn at either end, at most."""
-    flicker = VOCABULARY["flicker"].for_extent(Extent(10.0, 60.0, paper_plan()))
-    frequencies = flicker.entries[:, 0, 1]
-    assert flicker.prior.from_unit_cube(np.array([[0.5, 1.0, 0.5]]))[0, 1] == pytest.approx(0.5 / 1.2)
-    assert np.diff(frequencies).max() * np.ptp(paper_plan().time_s) <= 0.51
 
 
 def test_a_missing_voltage_of_the_battery_is_that_of_the_readings_around_it():

@@ -59,16 +59,6 @@ def test_a_mixture_takes_each_hypothesis_from_its_own_kind():
     assert mixed.albedo(np.array([[3.0, 0.0], [-0.5, 0.0]])).tolist() == [[0.0, 1.0], [1.0, 0.0], [1.0, 1.0]]
 
 
-@pytest.mark.parametrize("way", [1, -1])
-def test_a_polygon_has_one_closed_outline_whichever_way_its_vertices_go(way):
-    vertices = np.array([[0.0, 0.0], [14.0, 2.0], [9.0, 15.0], [4.0, 6.0]])[::way]
-    for region in (PolygonRegion.from_vertices(vertices[None]), PolygonRegion.from_even_odd_vertices(vertices)):
-        (trace,) = outlines(region)
-        np.testing.assert_array_equal(trace[0], trace[-1])
-        assert {tuple(place) for place in trace.tolist()} == {tuple(place) for place in vertices.tolist()}
-        assert len(trace) == 5
-
-
 @pytest.mark.parametrize(
     ("build", "message"),
     [

@@ -162,9 +162,3 @@ def test_scenes_name_their_parameters_and_give_their_regions():
 def test_a_space_of_shapes_that_cannot_be_is_named(build, message):
     with pytest.raises((ParameterError, ShapeError), match=message):
         build()
-
-
-def test_parameters_outside_the_prior_have_no_density(shape):
-    theta = draws(shape, 3)
-    theta[:, -1] = -5.0
-    assert np.isneginf(shape.prior.log_prob(theta)).all()

@@ -85,16 +85,6 @@ def test_hypotheses_predicted_in_blocks_read_as_all_at_once(monkeypatch):
     np.testing.assert_allclose(chain.predict(theta, plan), whole, atol=1e-8)
 
 
-def test_hypotheses_together_equal_one_by_one(model):
-    sensor, draw = model
-    theta, plan = draw(7), plan_of()
-    together = sensor.predict(theta, plan)
-    assert together.shape == (7, len(plan))
-    assert theta.shape[1] == len(sensor.names)
-    for i in range(7):
-        assert sensor.predict(theta[i : i + 1], plan)[0] == pytest.approx(together[i], abs=1e-8)
-
-
 def test_theta_of_another_width_is_refused(model):
     sensor, draw = model
     with pytest.raises(ShapeError, match="theta has shape"):
@@ -147,7 +137,6 @@ class Doer:
         return self.does(value, theta)
 
 
-SPREAD = Doer("spread", Stage.FOOTPRINT, lambda f, t: replace(f, var_u=f.var_u + t[:, :, None] ** 2))
 CURVE = Doer("curve", Stage.RESPONSE, lambda u, t: u**t)
 GAIN = Doer("gain", Stage.GAIN, lambda signal, t: signal * (1 + t))
 OFFSET = Doer("offset", Stage.OFFSET, lambda reading, t: reading + t)

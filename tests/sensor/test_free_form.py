@@ -13,7 +13,6 @@ from probewise.sensor import (
     FreeLevels,
     FreeMixture,
     bend_coefficients,
-    footprint_of,
     free_form_theta,
     is_free_form,
 )
@@ -25,25 +24,10 @@ RNG = np.random.default_rng(11)
 BENDS = 0.1 * RNG.standard_normal((6, N_BENDS))
 
 
-def moments(theta):
-    """Mean and covariance of whole mixtures by the law of total covariance, (n_samples, 5)."""
-    f = footprint_of(theta, theta.shape[1] // 6)
-    w = f.weight[:, 0]
-    u, v = (np.sum(w * m[:, 0], axis=1) for m in (f.u_mm, f.v_mm))
-    du, dv = f.u_mm[:, 0] - u[:, None], f.v_mm[:, 0] - v[:, None]
-    second = (f.var_u[:, 0] + du * du, f.var_v[:, 0] + dv * dv, f.cov_uv[:, 0] + du * dv)
-    return np.stack([u, v, *(np.sum(w * s, axis=1) for s in second)], axis=1)
-
-
 def predicted(theta):
     levels = np.tile([10.0, 60.0], (len(theta), 1))
     chain = Chain(FreeMixture(theta.shape[1] // 6), FreeLevels(), KnownScene(PLAN.patterns))
     return chain.predict(np.concatenate([theta, levels], axis=1), PLAN)
-
-
-def test_bends_leave_mean_and_covariance_alone():
-    bent = free_form_theta(np.repeat(ONE, 6, axis=0), BENDS)
-    np.testing.assert_allclose(moments(bent), np.repeat(moments(ONE), 6, axis=0), atol=1e-10)
 
 
 def test_readings_are_linear_in_the_bends():

@@ -9,7 +9,6 @@ from scipy.stats import multivariate_normal
 from probewise.errors import SlowWarning
 from probewise.recordings import patterns as kinds
 from probewise.scene import (
-    EllipseRegion,
     PolygonRegion,
     QuadrantRegion,
     disc_region,
@@ -85,17 +84,6 @@ def test_discs_of_all_sizes_hold_the_stated_error(discs, n_nodes, tolerance):
     for mean, cov, radius, wanted in discs:
         disc = disc_region(np.zeros((1, 2)), np.array([radius]))
         assert see(disc, *mean, cov, n_nodes=n_nodes) == pytest.approx(wanted, abs=tolerance)
-
-
-def test_an_ellipse_is_a_stretched_disc():
-    """Stretching scene and footprint together changes nothing: two routes to one number."""
-    cov, mean = covariance(5.0, 4.0, 0.2), np.array([12.0, 3.0])
-    angle = 0.6
-    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    stretch = turn @ np.diag([1.0, 0.4]) @ turn.T
-    ellipse = EllipseRegion(np.zeros((1, 2)), np.array([[15.0, 6.0]]), np.array([angle]))
-    found = see(ellipse, *(stretch @ mean), stretch @ cov @ stretch.T)
-    assert found == pytest.approx(over_a_disc(mean, cov, (0.0, 0.0), 15.0), abs=1e-8)
 
 
 @pytest.mark.parametrize("rho", [-0.95, -0.3, 0.0, 0.6, 0.95])

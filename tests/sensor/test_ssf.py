@@ -62,22 +62,6 @@ def test_the_mixture_of_a_field_keeps_its_moments(n_gaussians):
     assert mixture.cov_mm2 == pytest.approx(field.cov_mm2, rel=1e-4, abs=1e-3)
 
 
-def test_sampled_mixtures_are_summarised_by_the_law_of_total_covariance():
-    """One Gaussian for the mean of many fields: its moments are the mean field's."""
-    rng = np.random.default_rng(1)
-    theta = np.repeat(TWO, 20, axis=0)
-    theta[:, [1, 2, 7, 8]] += rng.normal(size=(20, 4))
-    footprint = footprint_of(theta, 2)
-    field = mean_ssf_field(footprint, u_mm=grid(60), v_mm=grid(60))
-    mixture = merged_mean_mixture(footprint)
-    assert mixture.mean_mm == pytest.approx(field.mean_mm, abs=1e-6)
-    assert mixture.cov_mm2 == pytest.approx(field.cov_mm2, abs=1e-4)
-    finer = merged_mean_mixture(footprint, n_gaussians=32)
-    assert finer.mean_mm == pytest.approx(field.mean_mm, abs=1e-6)
-    assert finer.cov_mm2 == pytest.approx(field.cov_mm2, abs=1e-4)
-    assert total_variation(finer, field) < 0.01 < total_variation(mixture, field)
-
-
 def test_two_lobes_are_not_merged_into_one():
     """Two Gaussians far apart, in samples that differ a little and have them in either order."""
     rng = np.random.default_rng(2)

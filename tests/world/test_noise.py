@@ -87,11 +87,6 @@ def test_dropouts_are_lost_to_one_value(ramp):
     assert abs(lost.mean() - 0.03) < 4 * math.sqrt(0.03 / N)
 
 
-def test_without_a_generator_there_is_no_noise_and_nothing_is_lost(ramp):
-    world = World(SPOT, concealed=(known.dropouts(0.5, -1.0), known.outliers(0.5, 10.0)))
-    np.testing.assert_array_equal(world.simulate(ramp, rng=None).readings, world.expected_readings(ramp))
-
-
 @pytest.mark.parametrize("model", OTHER_NOISE)
 def test_every_kind_of_noise_differs_from_white_as_it_is_called(model, ramp, noise):
     world = with_noise_model(World(SPOT), model, duration_s=float(N))

@@ -8,7 +8,7 @@ from scipy.special import ndtr
 from scipy.stats import multivariate_normal
 
 from probewise.errors import ParameterError, ShapeError
-from probewise.recordings import Disc, HalfPlane, Image, Polygon, Quadrant, Stripes, Uniform
+from probewise.recordings import Disc, HalfPlane, Image, Polygon, Quadrant, Stripes
 from probewise.world import Blob, Oval, Spot, albedo_at, gaussian_spot, ridge_spot, seen_white_fraction, tailed_spot
 
 BLOB = Blob(1.0, (0.0, 1.5), (4.0, 2.5), 0.15)
@@ -81,22 +81,10 @@ def test_a_disc_under_a_round_spot_is_the_rayleigh_integral():
     assert abs(got - (1 - math.exp(-16 / 18))) < 3e-4
 
 
-@pytest.mark.parametrize("spot", SPOTS)
-def test_a_plain_surface_shows_its_albedo(spot):
-    x, y, turn = poses()
-    np.testing.assert_allclose(seen_white_fraction(Uniform(0.3), SPOTS[spot](0.25), x, y, turn), 0.3, rtol=1e-12)
-
-
 def test_an_image_shows_nothing_outside_and_has_its_first_row_on_top():
     photo = Image(np.array([[0.1, 0.2], [0.3, 0.4]]), 2.0, (10.0, 20.0), "photo.npy")
     x, y = np.array([11.0, 13.0, 11.0, 13.0, 9.9, 14.1]), np.array([23.0, 23.0, 21.0, 21.0, 21.0, 21.0])
     np.testing.assert_array_equal(albedo_at(photo, x, y), [0.1, 0.2, 0.3, 0.4, 0, 0])
-
-
-def test_moments_of_a_gaussian_spot_are_those_asked_for():
-    mean, covariance = gaussian_spot([BLOB]).moments()
-    np.testing.assert_allclose(mean, [0, 1.5], atol=1e-6)
-    np.testing.assert_allclose(covariance, [[16, 1.5], [1.5, 6.25]], atol=0.006)
 
 
 @pytest.mark.parametrize(

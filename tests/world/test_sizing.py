@@ -25,59 +25,11 @@ def sizer(plan):
     return CleanSetup(plan, World(SPOT, noise_sd=0.5), left_by_levels)
 
 
-CURVES = {
-    "linear": lambda a: 3 * a,
-    "square": lambda a: a**2,
-    "square root": lambda a: math.sqrt(a),
-    "late": lambda a: max(a - 2.0, 0.0) * 5,
-    "levelling off": lambda a: 40 * a / (1 + a),
-    "steep": lambda a: math.expm1(a),
-}
-
-
-@pytest.mark.parametrize("name", CURVES)
-@pytest.mark.parametrize("wanted", [5.0, 20.0])
-def test_the_search_finds_the_amplitude_in_a_few_calls(name, wanted):
-    calls = []
-
-    def size(amplitude):
-        calls.append(amplitude)
-        return CURVES[name](amplitude)
-
-    amplitude = amplitude_of_size(size, wanted, first=0.3, limit=1000.0)
-    assert CURVES[name](amplitude) == pytest.approx(wanted, rel=0.02)
-    assert len(calls) <= 12
-
-
 def test_a_size_that_jumps_past_is_taken_where_it_comes_near_enough():
     assert amplitude_of_size(lambda a: 8.5 if a > 2 else 3.0, 8.0, first=1.0, limit=10.0) > 2
     with pytest.raises(NotConvergedError) as caught:
         amplitude_of_size(lambda a: 12.0 if a > 2 else 3.0, 8.0, first=1.0, limit=10.0)
     assert caught.value.partial[1] == 12.0
-
-
-def test_an_effect_that_is_too_small_at_its_limit_is_refused():
-    with pytest.raises(NotConvergedError, match="limit 10"):
-        amplitude_of_size(lambda a: 0.1 * a, 8.0, first=1.0, limit=10.0)
-    with pytest.raises(NotConvergedError):
-        amplitude_of_size(lambda a: 0.0, 8.0, first=1.0, limit=10.0)
-
-
-@pytest.mark.parametrize(
-    "of",
-    [
-        lambda a: known.ambient_gradient(a, 0.3 * a),
-        lambda a: known.saturation(60 - 50 * a),
-        lambda a: known.gain_drift(a, 60.0),
-    ],
-    ids=["ambient_gradient", "saturation", "gain_drift"],
-)
-def test_the_ruler_measures_what_survives_the_refit(of, sizer, plan):
-    amplitude = amplitude_of_size(lambda a: sizer.size(of(a)), 12.0, first=0.05, limit=1.0)
-    clean, changed = (World(SPOT, concealed=c).expected_readings(plan) for c in ((), (of(amplitude),)))
-    design = np.stack([np.ones(len(plan)), clean], axis=-1)
-    rest = changed - design @ np.linalg.lstsq(design, changed, rcond=None)[0]
-    assert np.linalg.norm(rest) / 0.5 == pytest.approx(12, rel=0.02)
 
 
 def test_the_cosine_is_that_of_the_surviving_parts(sizer, plan):

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from probewise.recordings import Disc, HalfPlane, Image, Polygon, Quadrant, Ramp, Stripes, Uniform
+from probewise.recordings import Disc, HalfPlane, Polygon, Quadrant, Stripes
 from probewise.world import Oval, albedo_at
 from probewise.world.surfaces import common_edge_normal, distance_to_nearest_edge
 
@@ -32,11 +32,6 @@ def test_the_distance_is_that_to_the_nearest_change_of_albedo(name):
         changed = albedo_at(surface, ray_x, ray_y) != albedo_at(surface, x[k : k + 1], y[k : k + 1])
         nearest = radius[np.flatnonzero(changed.any(axis=1))[0]]
         assert distance[k] == pytest.approx(nearest, abs=0.04)
-
-
-@pytest.mark.parametrize("surface", [Uniform(0.3), Ramp(0.0, 0.01), Image(np.ones((2, 2)), 1.0, (0, 0), "a.npy")])
-def test_what_has_no_printed_edge_is_infinitely_far_from_one(surface):
-    np.testing.assert_array_equal(distance_to_nearest_edge(surface, np.zeros(2), np.ones(2)), np.inf)
 
 
 def test_across_is_the_normal_of_straight_edges_and_x_elsewhere():

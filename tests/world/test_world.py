@@ -24,12 +24,6 @@ def clean():
     return world().expected_readings(PLAN)
 
 
-def test_plain_black_and_white_read_the_two_levels(clean):
-    names = np.array(PLAN.pattern_names)[PLAN.pattern]
-    np.testing.assert_allclose(clean[names == "black"], 10)
-    np.testing.assert_allclose(clean[names == "white"], 60)
-
-
 def test_one_reading_by_one_gives_the_same_as_the_whole_plan(clean):
     effects = world(
         known.backlash(1.0),
@@ -59,20 +53,6 @@ def test_one_reading_by_one_gives_the_same_as_the_whole_plan(clean):
 def test_readings_are_rounded_to_the_step():
     readings = world(step=0.5).simulate(paper_plan(), rng=np.random.default_rng(7)).readings
     np.testing.assert_array_equal(readings * 2, np.round(readings * 2))
-
-
-def test_effects_stack_in_the_order_of_the_chain_whatever_their_order_in_the_list():
-    effects = (
-        known.saturation(45.0),
-        known.ambient_gradient(0.02, 0.0),
-        known.gain_drift(0.1, 300.0),
-        known.nonlinearity(1.1),
-        known.backlash(1.0),
-    )
-    np.testing.assert_array_equal(
-        world(*effects).expected_readings(PLAN), world(*effects[::-1]).expected_readings(PLAN)
-    )
-    assert world(*effects).expected_readings(PLAN).max() == 45
 
 
 def test_an_effect_of_ones_own_is_one_short_function(clean):

@@ -55,17 +55,6 @@ def test_the_density_is_the_priors_times_the_volume_that_coordinates_stretch(n_g
         assert log_density[0] == pytest.approx(expected, abs=1e-6)
 
 
-def test_what_is_not_sorted_by_mass_is_outside_the_prior():
-    belief = prior(3, by_mass=True)
-    space = belief.coordinates
-    x = space.enter(belief.from_unit_cube(np.random.default_rng(7).random((20, 20))))
-    heavier, swapped = x.copy(), x.copy()
-    heavier[:, 6] = 0.1
-    swapped[:, [6, 12]] = swapped[:, [12, 6]]
-    assert (space.leave(heavier)[1] == -np.inf).all()
-    assert (space.leave(swapped)[1] == -np.inf).all()
-
-
 @pytest.mark.parametrize("n", [1, 2, 3])
 def test_without_labels_parameters_come_back_but_for_the_light_of_all(n):
     """Readings depend on ratios of light alone, so that the sum of its logs may differ; labels change no density."""

@@ -1,23 +1,11 @@
 import numpy as np
 import pytest
 
-from probewise.calibration import choose_pixel_mm, mixture_moments, posterior_mean_ssf_field
-from probewise.calibration.fields import gaussians_sorted_by_mass
+from probewise.calibration import mixture_moments, posterior_mean_ssf_field
 from probewise.errors import ParameterError, ShapeError
 
 ONE = np.array([[1.0, 0.5, 1.5, 0.03, 0.08, -0.01]])
 TWO = np.array([[0.2, 2.0, 0.0, 0.5, 0.5, 0.0, 0.9, -1.0, 1.0, 0.02, 0.03, 0.005]])
-
-
-def test_the_mean_field_is_the_weighted_mean_of_the_fields_on_one_grid():
-    other = ONE + np.array([0, 4.0, -2.0, 0.05, 0.0, 0.0])
-    both = posterior_mean_ssf_field(np.concatenate([ONE, other]), 1, weight=np.array([0.25, 0.75]))
-    cov = [0.5 * np.linalg.inv([[t[0, 3], t[0, 5]], [t[0, 5], t[0, 4]]]) for t in (ONE, other)]
-    mean = 0.25 * ONE[0, 1:3] + 0.75 * other[0, 1:3]
-    apart = [t[0, 1:3] - mean for t in (ONE, other)]
-    total = sum(w * (c + np.outer(d, d)) for w, c, d in zip((0.25, 0.75), cov, apart, strict=True))
-    np.testing.assert_allclose(both.mean_mm, mean, atol=1e-2)
-    np.testing.assert_allclose(both.cov_mm2, total, rtol=5e-3)
 
 
 def test_a_footprint_too_wide_for_the_grid_gets_wider_pixels():
@@ -27,28 +15,12 @@ def test_a_footprint_too_wide_for_the_grid_gets_wider_pixels():
     assert max(field.values.shape) <= 302
 
 
-def test_the_pixel_is_a_millimetre_and_finer_for_fine_scans_and_narrow_footprints():
-    wide = ONE * [1, 1, 1, 0.3, 0.1, 0.1]
-    assert choose_pixel_mm(wide, 1, step_mm=1.0) == 1.0
-    assert choose_pixel_mm(wide, 1, step_mm=5.0) == 1.0
-    assert choose_pixel_mm(wide, 1, step_mm=0.05) == 0.05
-    assert choose_pixel_mm(np.array([[1.0, 0, 0, 0.5, 0.5, 0.0]]), 1, step_mm=1.0) == 0.2
-
-
 def test_moments_of_a_mixture_are_those_of_its_field():
     found = mixture_moments(TWO, 2)
     field = posterior_mean_ssf_field(TWO, 2, pixel_mm=0.2)
     np.testing.assert_allclose([found["centre x'"][0], found["centre y'"][0]], field.mean_mm, atol=2e-3)
     np.testing.assert_allclose(np.exp(found["log width along x'"][0]) ** 2, field.cov_mm2[0, 0], rtol=5e-3)
     np.testing.assert_allclose(np.exp(found["log width along y'"][0]) ** 2, field.cov_mm2[1, 1], rtol=5e-3)
-
-
-def test_numbering_by_mass_puts_the_heavier_gaussian_first_and_keeps_the_field():
-    sorted_ = gaussians_sorted_by_mass(np.concatenate([TWO, [[7.0]]], axis=1), 2)
-    np.testing.assert_array_equal(sorted_, np.concatenate([TWO[:, 6:], TWO[:, :6], [[7.0]]], axis=1))
-    np.testing.assert_allclose(
-        posterior_mean_ssf_field(sorted_, 2).values, posterior_mean_ssf_field(TWO, 2).values, rtol=1e-9
-    )
 
 
 def test_weights_that_do_not_match_and_pixels_of_no_size_are_refused():

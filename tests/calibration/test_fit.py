@@ -1,5 +1,4 @@
 import json
-import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -10,11 +9,8 @@ from scipy.stats import ks_2samp
 
 from probewise.calibration import calibrate, default_prior, estimate_ssf, paper_prior, problem_for
 from probewise.errors import DoubtfulResultWarning, ParameterError
-from probewise.inference import sd_ceiling, sd_floor
 from probewise.nested import EvidenceChange
 from probewise.recordings import fingerprint
-from probewise.scene import KnownScene
-from probewise.sensor import Chain, FreeLevels, FreeMixture
 
 
 def test_calibration_finds_the_parameters_that_made_the_readings(calibration, truth):
@@ -36,22 +32,6 @@ def test_the_calibration_says_what_it_rests_on(calibration, recording):
     assert calibration.fields[1].values.sum() == pytest.approx(1.0)
     assert "most probable" in calibration.summary()
     json.loads(sensor.to_json())
-
-
-def test_the_likelihood_is_the_product_over_scans(recording, truth):
-    """Sigma integrated numerically, scan by scan, against the problem's closed form."""
-    problem = problem_for(recording, default_prior(recording, 1))
-    plan = recording.plan
-    residual = recording.readings - Chain(FreeMixture(1), FreeLevels(), KnownScene(plan.patterns)).predict(
-        truth[None], plan
-    )
-    log_sd = np.linspace(math.log(sd_floor(recording)), math.log(sd_ceiling(recording)), 20_001)
-    total = 0.0
-    for rows in plan.rows_by_scan():
-        q, n = float((residual[0, rows] ** 2).sum()), len(rows)
-        log_p = -n * log_sd - q / 2 * np.exp(-2 * log_sd) - n / 2 * math.log(2 * math.pi)
-        total += math.log(np.trapezoid(np.exp(log_p - log_p.max()), log_sd) / np.ptp(log_sd)) + log_p.max()
-    assert problem.log_likelihood(truth[None])[0] == pytest.approx(total, abs=1e-6)
 
 
 def test_readings_left_out_change_nothing_but_are_counted(recording, truth):

@@ -57,30 +57,6 @@ def test_a_declared_step_gives_masses_of_cells_that_sum_to_one(sensor):
     assert total == pytest.approx(1.0, abs=1e-9)
 
 
-def test_a_plan_that_declares_no_step_has_that_of_the_sensor(sensor):
-    """Its own comes first: readings may be logged more coarsely than the sensor rounds them."""
-    stepped = replace(sensor, instrumentation=replace(sensor.instrumentation, step=1.0))
-    bare = _disc_plan()
-    declaring = {step: replace(bare, instrumentation=replace(bare.instrumentation, step=step)) for step in (1.0, 5.0)}
-    readings = np.round(predict(sensor, bare).mean)
-    found = predict(stepped, bare, readings)
-    np.testing.assert_array_equal(found.log_density, predict(sensor, declaring[1.0], readings).log_density)
-    assert np.abs(found.log_density - predict(sensor, bare, readings).log_density).max() > 1e-3
-    coarse = predict(stepped, declaring[5.0], readings).log_density
-    np.testing.assert_array_equal(coarse, predict(sensor, declaring[5.0], readings).log_density)
-    assert np.abs(coarse - found.log_density).max() > 1e-3
-
-
-def test_missing_readings_and_those_out_of_range_have_no_density_but_a_prediction(sensor):
-    plan = replace(_disc_plan(), instrumentation=Instrumentation(min=0.0, max=100.0))
-    readings = np.full(21, 30.0)
-    readings[[3, 4]] = np.nan, 120.0
-    found = predict(sensor, plan, readings)
-    assert np.flatnonzero(np.isnan(found.log_density)).tolist() == [3, 4]
-    assert np.isfinite(found.mean).all()
-    assert (found.sd > 0).all()
-
-
 def test_effects_carry_over_but_those_of_single_scans_do_not(sensor, make_sensor):
     """Gear play of 2 mm shifts a one-way scan by 1 mm."""
     extra = {"scan_misplacement.offset_mm": 5.0, "backlash.width_mm": 2.0}

@@ -29,13 +29,6 @@ def climbed(recording, order, seed):
     return ends, high
 
 
-def test_the_peak_of_one_gaussian_is_no_lower_than_the_truth(recording, truth):
-    problem = ProblemsByOrder(recording, default_prior).problem(1)
-    ends, high = climbed(recording, 1, 9)
-    assert high[0] >= problem.log_likelihood(truth[None])[0]
-    assert high[0] == pytest.approx(problem.log_likelihood(ends[:1])[0])
-
-
 def test_two_lobes_are_climbed(two_lobes):
     assert climbed(two_lobes, 2, 13)[1][0] > climbed(two_lobes, 1, 13)[1][0] + 50
     centres = climbed(two_lobes, 2, 13)[0][0, [1, 2, 7, 8]].reshape(2, 2)

@@ -41,19 +41,6 @@ def test_what_is_not_asked_is_what_would_be_answered(shape):
     assert predict_where_visible(model, theta, PLAN) == pytest.approx(model.predict(theta, PLAN), abs=1e-6)
 
 
-def test_most_hypotheses_are_not_asked_about_most_places():
-    shape, pairs = SHAPES[2], []
-
-    class Watched(Chain):
-        def predict(self, theta, plan):
-            pairs.append(len(theta) * len(plan))
-            return super().predict(theta, plan)
-
-    model = Watched(MIXTURE, LEVELS, HypothesisScene(shape), n_nodes=FAST_NODES)
-    predict_where_visible(model, hypotheses(shape), PLAN)
-    assert sum(pairs) < 0.6 * 40 * len(PLAN)
-
-
 @pytest.mark.parametrize(
     "model",
     [chain(SHAPES[0], FreeLevels()), chain(SHAPES[0], effects=(EFFECTS["gain_drift"](),))],

@@ -1,6 +1,5 @@
 """An inquiry over any settings: its posterior against a closed form, its choices, its forms, what it refuses."""
 
-import copy
 import math
 import subprocess
 import sys
@@ -11,7 +10,7 @@ import pytest
 from scipy import stats
 
 from probewise.errors import ParameterError
-from probewise.inquiry import Inquiry, ReadingNoise
+from probewise.inquiry import Inquiry
 from probewise.priors import LogUniform, Normal, Uniform
 
 LINE = {"slope": Normal(0.0, 1.0), "offset": Normal(0.0, 2.0)}
@@ -104,13 +103,6 @@ def test_seconds_count():
     assert asked.utility_label.endswith("per second")
 
 
-def test_the_same_generator_and_readings_give_the_same_choices():
-    noise = [0.1, -0.3, 0.2, 0.4]
-    runs = [follow(inquiry(), lambda x, left=list(noise): x + left.pop(), 4) for _ in range(2)]
-    assert runs[0].readings == runs[1].readings
-    np.testing.assert_array_equal(runs[0].posterior.theta, runs[1].posterior.theta)
-
-
 def test_a_reading_without_its_setting_is_taken_once_for_each_choice():
     asked = inquiry()
     for _ in range(2):
@@ -119,17 +111,6 @@ def test_a_reading_without_its_setting_is_taken_once_for_each_choice():
         asked.next()
         asked.tell(0.5)
     assert len(asked.readings) == 2
-
-
-def test_what_a_copy_is_told_is_not_told_to_the_inquiry():
-    asked = inquiry()
-    copy.copy(asked).tell(1.0, 0.5)
-    assert asked.readings == ()
-
-
-def test_readings_taken_together_are_spread():
-    """Of two readings of a line, one at each end tells most; the same place twice tells less."""
-    assert sorted(inquiry(n_samples=2000, noise=0.05).several(2)) == [0.0, 2.0]
 
 
 def test_the_way_to_the_second_of_two_readings_begins_at_the_first():
@@ -201,15 +182,6 @@ def test_an_unknown_sd_is_inferred():
     assert asked.posterior.names[-1] == "noise.sd"
     low, high = asked.posterior.interval(0.99)[:, -1]
     assert low < 0.4 < high < 1.2
-
-
-def test_outliers_do_not_move_what_is_known():
-    asked = inquiry(noise=ReadingNoise(0.3, outliers=0.1, between=(-20.0, 20.0)))
-    for x in (*PLACES, *PLACES):
-        asked.tell(0.5 * x, x)
-    before = asked.posterior.mean()
-    asked.tell(15.0, 1.0)
-    np.testing.assert_allclose(asked.posterior.mean(), before, atol=0.1)
 
 
 def test_readings_that_no_hypothesis_explains_are_doubted():

@@ -1,7 +1,6 @@
 """What a reading is worth, against counting, quadrature and what must hold of any information."""
 
 from dataclasses import dataclass, replace
-from math import log2
 
 import numpy as np
 import pytest
@@ -17,13 +16,11 @@ from probewise.inquiry import (
     ParameterValue,
     PerSecond,
     ReadingEntropy,
-    Readout,
     WhichShape,
     choose_several,
     utility_map,
     utility_named,
 )
-from probewise.inquiry.utilities import _probability_of_reaching_target as probability
 
 APART = [[0.0, 0.0, 0.0], [0.0, 40.0, 40.0], [0.0, 0.0, 80.0], [0.0, 40.0, 120.0]]
 """Four hypotheses: the first place tells nothing, the second one bit, the third all two."""
@@ -44,17 +41,6 @@ def test_predictions_nearer_than_the_noise_tell_what_quadrature_says(made):
     exact = [by_quadrature(column, weight, 1.0) for column in table.T]
     bits = InformationGain()(made.listed(table, weight=weight, step=None))
     np.testing.assert_allclose(bits, exact, atol=0.04)
-
-
-def test_repeats_tell_more_and_never_more_than_all_there_is(made):
-    table = np.random.default_rng(4).normal(0.0, 1.0, (30, 6))
-    inputs = made.listed(table, step=None, repeats=(1, 4, 16))
-    once, four, sixteen = InformationGain()(inputs).reshape(3, 6)
-    assert (once < four).all()
-    assert (four < sixteen).all()
-    assert (sixteen <= log2(30)).all()
-    narrow = InformationGain()(made.listed(table, step=None, noise_sd=0.5))
-    np.testing.assert_allclose(four, narrow, atol=0.02)
 
 
 def test_information_about_a_label_leaves_the_rest_out(made):
@@ -83,22 +69,11 @@ def test_a_map_of_one_of_two_measures_says_which(made):
     np.testing.assert_array_equal(shown.values[near.rows], Finishing(least=1e-6)(near))
 
 
-@pytest.mark.parametrize("least", [0.0, 1.5])
-def test_a_chance_that_is_none_is_refused(least):
-    with pytest.raises(ParameterError, match="least"):
-        Finishing(least=least)
-
-
 def test_readings_chosen_together_do_not_repeat_each_other(made):
     """Two bits in two places of one bit each, a third that repeats the first but for a little less noise's worth."""
     table = [[0.0, 0.0, 0.0], [0.0, 40.0, 0.0], [40.0, 0.0, 30.0], [40.0, 40.0, 30.0]]
     chosen = choose_several(made.listed(table), 2, rng=np.random.default_rng(6))
     assert set(chosen) in ({0, 1}, {1, 2})
-
-
-def test_a_reading_chosen_is_the_best_one_that_is_likely_not_to_be_missing(made):
-    chance = np.array([1.0, 1.0, 1e-3])
-    assert choose_several(made.listed(APART), 1, rng=np.random.default_rng(7), chance=chance) == (1,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,13 +136,6 @@ def test_near_the_end_the_reading_that_may_end_the_run_is_preferred(made):
     assert chance[best] == pytest.approx(by_importance(made, inputs, goal, best), abs=0.06)
 
 
-def test_four_readings_end_a_run_as_one_of_half_the_noise_does(made):
-    near = narrow(made, Goal((2,), 5.0))
-    each = replace(near, readout=Readout(2.0), designs=replace(near.designs, repeats=(4,)))
-    designs = np.arange(0, len(near.rows), 500)
-    np.testing.assert_allclose(probability(each, each.goal, designs), probability(near, near.goal, designs), atol=1e-9)
-
-
 def by_importance(made, inputs, goal, design, n=4000):
     """Draw readings from every hypothesis, reweigh all by each, count how often the sds are small enough."""
     level = made.chain(20).predict(inputs.theta, inputs.plan.take(np.array([design])))[:, 0]
@@ -188,8 +156,3 @@ def test_far_from_the_end_or_without_a_goal_information_decides(made):
     np.testing.assert_array_equal(Finishing()(goalless), InformationGain()(goalless))
     hopeless = narrow(made, Goal((0, 1, 2), 1.0))
     np.testing.assert_array_equal(Finishing()(hopeless), InformationGain()(hopeless))
-
-
-def test_the_bins_of_entropy_are_as_wide_as_the_instruments_step():
-    assert utility_named("entropy", bin_width=0.005) == ReadingEntropy(0.005)
-    assert utility_named("entropy") == ReadingEntropy(1.0)

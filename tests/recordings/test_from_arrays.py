@@ -92,12 +92,6 @@ def test_scans_that_are_named_by_numbers_get_a_note_that_1_10_is_1_1():
     assert not made(scan=["1.1", "1.10", "2"]).notes
 
 
-def test_scans_begin_where_their_name_changes_and_times_are_a_second_apart():
-    plan = made(scan=[1, 2, 1]).plan
-    assert (plan.scan.tolist(), plan.scan_names) == ([0, 1, 2], ("1", "2", "1"))
-    assert plan.time_s.tolist() == [0.0, 1.0, 2.0]
-
-
 def test_missing_readings_and_those_out_of_range_are_left_out_and_noted():
     recording = made(reading=[None, 9, 2.5], max=5)
     assert recording.usable.tolist() == [False, False, True]
@@ -166,12 +160,6 @@ def test_dates_with_and_without_a_time_zone_are_refused_together():
 def test_what_cannot_be_a_recording_is_refused_in_words(changes, message):
     with pytest.raises((ParameterError, ShapeError), match=message):
         made(**changes)
-
-
-def test_patterns_take_lists_and_numpy_numbers_as_they_take_tuples_and_floats():
-    assert Disc([0, 0], np.float32(40)) == Disc((0.0, 0.0), 40.0)
-    assert Polygon(np.array([[0, 0], [1, 0], [0, 1]])) == Polygon(((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)))
-    assert repr(Quadrant([0, 0], [1, -1])) == repr(Quadrant((0.0, 0.0), (1, -1)))
 
 
 @pytest.mark.parametrize(

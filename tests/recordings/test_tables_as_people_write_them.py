@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 
 from probewise.errors import FileError
-from probewise.recordings import read_recording
-from probewise.recordings.cells import first_cell_without_number
 from probewise.systems import read_run_table
 
 TIMES = [0, 3, 6, 9]
@@ -214,22 +212,3 @@ def test_dates_need_a_unit_of_time_with_a_length(tmp_path):
     path = put(tmp_path, table("2026-01-20 22:09:{t:02},{y}"))
     with pytest.raises(FileError, match='in place of "month"'):
         read_run_table(path, time="t_s", run=None, time_unit="month")
-
-
-def test_a_recording_is_read_by_the_same_rules(tmp_path):
-    path = put(tmp_path, "x_mm;y_mm;reading;scan;time_s\n0,5;0;1,5;1.10;10:00:00\n1,5;0;2,5;1,1;10:00:02\n")
-    path.with_suffix(".json").write_text(
-        '{"format": "recording/1", "patterns": {"white": {"kind": "uniform", "albedo": 1}}}', encoding="utf-8"
-    )
-    recording = read_recording(path)
-    assert recording.plan.x_mm.tolist() == [0.5, 1.5]
-    assert recording.readings.tolist() == [1.5, 2.5]
-    assert recording.plan.time_s.tolist() == [0.0, 2.0]
-    assert recording.plan.scan_names == ("1.10", "1,1")
-    assert "decimal commas in x_mm, reading" in recording.notes[0]
-
-
-def test_of_decimal_commas_and_a_word_the_word_is_at_fault():
-    assert first_cell_without_number(["1,5", "", "nope", "2,5"]) == 2
-    assert first_cell_without_number(["", "1,5", "2,5"]) == 1
-    assert first_cell_without_number(["1.5", ""]) is None

@@ -24,12 +24,6 @@ def test_what_is_written_is_read_back_bit_for_bit():
     assert FittedSystem.from_json(text, SIMULATOR).to_json() == text
 
 
-def test_the_file_of_another_simulator_is_refused():
-    other = dataclasses.replace(SIMULATOR, fingerprint="def")
-    with pytest.raises(FileError, match=r"fingerprint abc.*has def"):
-        FittedSystem.from_json(fitted().to_json(), other)
-
-
 def _places(value, at=()):
     """Every place of a JSON value: all entries of its objects, the first of its lists."""
     yield at
@@ -109,11 +103,3 @@ def test_predictions_that_are_no_number_are_stored():
     np.testing.assert_array_equal(known.predicted, predicted)
     np.testing.assert_array_equal(known.states["warm"], predicted)
     assert known.sd == 0.07
-
-
-def test_the_file_of_another_reading_is_refused_without_fingerprints():
-    here, there = (dataclasses.replace(SIMULATOR, fingerprint="", unit=unit) for unit in ("degC", "K"))
-    text = dataclasses.replace(fitted(), simulator=here).to_json()
-    assert FittedSystem.from_json(text, here).to_json() == text
-    with pytest.raises(FileError, match=r"fitted to temp_c \(degC\); allowed: a model of temp_c \(K\)"):
-        FittedSystem.from_json(text, there)

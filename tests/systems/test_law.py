@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from probewise.errors import ParameterError
 from probewise.systems import Law, Noise, RunTable, Simulator, System
 from probewise.systems.forms import ReferenceFit, bind_forms
-from probewise.systems.integrate import Integrations, integrate_states
+from probewise.systems.integrate import integrate_states
 from probewise.systems.law import LawWithEffects, Limit, steps_for_table
 from probewise.systems.system import with_converged_step
 
@@ -29,30 +29,12 @@ def _states(motion, table, parameters, max_step):
     return {k: v[0] for k, v in integrate_states(motion, steps_for_table(table, max_step), own, columns).items()}
 
 
-def test_dry_friction_brings_a_body_to_rest_after_the_time_that_its_speed_lasts():
-    """v = v0 - a t until 0, then it sticks."""
-    law, table = Law({"v": 1.0}, lambda s, p, u: {"v": 0.0 * s["v"]}), _table(np.linspace(0, 4, 81))
-    found = _states(LawWithEffects(law).plus(friction={"v": np.full((1, 1), 0.5)}), table, {}, 0.05)["v"]
-    np.testing.assert_allclose(found, np.maximum(1 - 0.5 * table.time_s, 0), atol=0.03)
-    assert np.all(found[table.time_s > 2.1] == 0)
-
-
 def test_a_body_breaks_loose_within_a_step_when_the_force_exceeds_its_friction():
     """Closed form: a force of 2 t exceeds a friction of 1 at 0.5, amid the first step, and v = (t - 0.5)^2 after it."""
     law = Law({"v": 0.0}, lambda s, p, u: {"v": 2 * u["t_s"] + 0 * s["v"]})
     table = _table(np.linspace(0, 4, 6))
     found = _states(LawWithEffects(law).plus(friction={"v": np.full((1, 1), 1.0)}), table, {}, 0.8)["v"]
     np.testing.assert_allclose(found, np.maximum(table.time_s - 0.5, 0) ** 2, atol=1e-12)
-
-
-def test_a_tank_that_overflows_stays_full_and_empties_at_once_when_the_inflow_ends():
-    law = Law({"level": 0.0}, lambda s, p, u: {"level": u["inflow"] - 0.5 * s["level"]})
-    times = np.linspace(0, 10, 201)
-    table = _table(times, inflow=np.where(times < 5, 1.0, 0.0))
-    found = _states(LawWithEffects(law).plus(limits=(Limit("level", np.full((1, 1), 1.2)),)), table, {}, 0.05)["level"]
-    assert found.max() == pytest.approx(1.2)
-    after = times >= 5
-    np.testing.assert_allclose(found[after], 1.2 * np.exp(-0.5 * (times[after] - 5)), atol=1e-3)
 
 
 def test_what_a_tank_spills_into_the_next_one_is_there():
@@ -259,22 +241,6 @@ def test_an_input_goes_on_between_rows_as_what_moves_it(name, hold, about_of, fo
     size = np.abs(expected - about.predicted).max()
     assert size > 0.1
     np.testing.assert_allclose(found, expected, atol=1e-5 * size)
-
-
-@pytest.mark.parametrize("hold", ["previous", "linear"])
-@pytest.mark.parametrize("name", ["depends:k:force", "steps:k", "input_delay:force"])
-def test_all_steps_at_once_lead_where_stepping_leads_with_effects_on_inputs(name, hold, about_of, forms_of):
-    about, setting = about_of[hold], np.array(CASES[name][0] if name in CASES else [0.33])
-    settings = setting * (1 + 0.02 * np.random.default_rng(1).normal(size=(5, len(setting))))
-    refusing = Integrations(n_refused=99)  # it is stepped
-    stepped = replace(about, system=replace(about.system, integrations=refusing))
-    expected = _predicted(stepped, forms_of[hold][name], settings)
-    own = replace(about, system=replace(about.system, integrations=Integrations()))
-    own.system.chain(TABLE, ()).predict(own.theta, TABLE)
-    for _ in range(2):
-        np.testing.assert_allclose(_predicted(own, forms_of[hold][name], settings), expected, atol=1e-9)
-    assert own.system.integrations.n_refused == 0
-    assert not refusing.known
 
 
 def test_a_late_column_that_is_held_conserves_what_it_brings():

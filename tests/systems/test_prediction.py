@@ -62,14 +62,6 @@ def test_a_new_run_has_an_offset_as_those_of_the_recorded_runs_differ():
     np.testing.assert_allclose(np.sqrt(found.sd[0] ** 2 - plain.sd[0] ** 2), np.sqrt(8 / 3), rtol=0.15)
 
 
-def test_a_table_without_readings_is_predicted_and_not_scored():
-    table = runs()
-    bare = dataclasses.replace(table, columns={k: v for k, v in table.columns.items() if k != "temp_c"})
-    found = predicted(fitted(), bare)
-    assert np.isnan(found.log_density).all()
-    np.testing.assert_array_equal(found.mean, predicted(fitted(), table).mean)
-
-
 def test_a_row_that_lacks_a_column_is_not_predicted_and_the_others_are():
     table = runs()
     power = table.columns["power_w"].copy()
@@ -84,19 +76,6 @@ def test_predictions_are_written_row_by_row_with_the_columns_of_the_table(tmp_pa
     lines = (tmp_path / "p.csv").read_text().splitlines()
     assert lines[0] == "run,t_s,power_w,room_c,temp_c,mean,sd,log_density"
     assert len(lines) == 1 + len(runs())
-
-
-def test_the_density_of_a_new_run_does_not_hang_on_which_starts_were_drawn():
-    """The start is normal about 20 with sd 5: at time 0 a reading has that density, however small its noise."""
-    model = _with_starts(22.0, 23.0)
-    model = dataclasses.replace(model, samples=model.samples[:500], noise_sd=np.full(500, 0.001))
-    table = runs((20.0,), names="9", n=4)
-    readings = np.array([14.0, 20.0, 23.0, 26.0])
-    for reading in readings:
-        columns = {**table.columns, "temp_c": np.full(4, reading)}
-        found = predicted(model, dataclasses.replace(table, columns=columns))
-        expected = -0.5 * ((reading - 20) / 5) ** 2 - np.log(5 * np.sqrt(2 * np.pi))
-        assert abs(found.log_density[0] - expected) < 0.25
 
 
 def _line_with(effect, **sizes):
@@ -171,14 +150,6 @@ def _model_with_a_step_at_a_row():
     return known_model(about.system.simulator, values, extract_stored_fit(about)), about.table
 
 
-def test_a_step_at_a_row_is_there_in_the_recording_and_its_first_rows():
-    model, table = _model_with_a_step_at_a_row()
-    np.testing.assert_allclose(predicted(model, table).mean, table.columns["y"])
-    np.testing.assert_allclose(predicted(model, table.take(np.arange(30))).mean, table.columns["y"][:30])
-    both = RunTable({name: np.concatenate([v, v[:5]]) for name, v in table.columns.items()})
-    np.testing.assert_allclose(predicted(model, both).mean[40:], 3.0 + table.columns["x"][:5])
-
-
 @pytest.mark.parametrize("rows", [(5, 20), (20, 40), (39, 40), (0, 1)], ids=["middle", "second file", "last", "first"])
 def test_a_part_of_the_recording_is_predicted_where_it_is_in_it(rows):
     """Rows 5 to 19 were predicted as what comes after the recording, with the step on."""
@@ -251,17 +222,6 @@ def test_an_effect_or_a_parameter_that_no_model_keeps_is_refused(name):
     )
     with pytest.raises(ParameterError, match=name.split(".")[1 if "lag" in name else 0]):
         predicted(model, runs())
-
-
-def test_a_column_with_a_colon_in_its_name_that_an_effect_reads_must_be_there():
-    x = np.random.default_rng(6).normal(size=(2, 40))
-    table = RunTable({"x": x[0], "room:c": x[1], "y": x[0] + x[1]})
-    simulator = Simulator("y", "V", {"a": (-5, 5)}, simulate=lambda p, u: p["a"] + u["x"])
-    about = ReferenceFit(System.of(simulator, table), table, np.zeros(1), 0.1)
-    model = known_model(simulator, {"a": 0.0, "sensitivity:room:c.a": 1.0}, extract_stored_fit(about))
-    np.testing.assert_allclose(predicted(model, table).mean, x[0] + x[1] - x[1].mean())
-    with pytest.raises(ParameterError, match="room:c"):
-        predicted(model, {"x": x[0]})
 
 
 def test_a_row_that_no_sample_predicts_is_told():

@@ -54,13 +54,6 @@ def test_names_of_runs_are_texts(given, names):
     assert table.columns["run"].tolist() == [names[k] for k in table.scan]
 
 
-@pytest.mark.parametrize("given", [[1.1, 1.1, 2.0], np.array([1.1, 1.1, 2.0], dtype=object)])
-def test_names_of_runs_that_were_read_as_numbers_with_a_fraction_are_noted(given):
-    """1.10 was 1.1 before it came here."""
-    assert "of which 1.10 is 1.1" in RunTable({"run": given, "x": np.zeros(3)}, run="run").notes[0]
-    assert not RunTable({"run": [1.0, 2.0, 3.0], "x": np.zeros(3)}, run="run").notes
-
-
 def test_rows_without_a_run_and_dates_without_marks_are_noted_once():
     """A spreadsheet leaves a repeated name out; 20260131 is followed by 20260201, 70 later."""
     for times, n_notes in (([20260131, 20260201], 2), ([20260131235958.0, 20260131235959.5], 2), ([0, 1], 1)):
@@ -68,12 +61,6 @@ def test_rows_without_a_run_and_dates_without_marks_are_noted_once():
         assert len(table.notes) == n_notes
         assert "fill it in" in table.notes[0]
     assert not RunTable({"run": ["", ""], "t": [20261301, 20261302]}, run="run", time="t").notes
-
-
-def test_a_simulator_gets_names_of_runs_as_numbers_only_if_they_are_different_numbers():
-    for given, expected in ((["1", "02"], [1.0, 2.0]), (["1.1", "1.10"], ["1.1", "1.10"]), (["1", "b"], ["1", "b"])):
-        table = RunTable({"run": given, "x": [0.0, 1.0]}, run="run")
-        assert table.columns_as_given["run"].tolist() == expected
 
 
 _FIRST = datetime.datetime(2026, 11, 23, 18, 0)
@@ -140,18 +127,3 @@ def test_the_same_table_twice_or_texts_where_the_first_has_numbers_are_refused()
     cells[2] = "warm"
     with pytest.raises(ParameterError, match=r"column 'room_c' of b.csv in row 4 is 'warm'"):
         concatenate_tables([runs(), second.with_columns({"room_c": cells})], ["a.csv", "b.csv"])
-
-
-def test_tables_without_runs_are_a_run_each():
-    first, second = RunTable({"x": [1.0, 2.0]}), RunTable({"x": [3.0]})
-    joined, _ = concatenate_tables([first, second], ["a.csv", "b.csv"])
-    assert joined.scan_names == ("a.csv", "b.csv")
-
-
-def test_runs_named_by_numbers_are_joined_with_runs_named_by_texts():
-    first = RunTable({"day": [1.0, 1.0, 2.0], "x": [1.0, 2.0, 3.0]}, run="day")
-    advised = RunTable({"day": ["1 again", "1 again"], "x": [1.0, 2.0]}, run="day")
-    joined, _ = concatenate_tables([first, advised], ["a.csv", "next.csv"])
-    assert joined.scan_names == ("1", "2", "1 again")
-    assert list(joined.columns) == ["day", "x"]
-    assert concatenate_tables([advised, first], ["next.csv", "a.csv"])[0].scan_names == ("1 again", "1", "2")

@@ -10,10 +10,8 @@ from probewise.effects.effect import sentence_from_samples
 from probewise.systems import FittedSystem, Law, RunTable, Simulator, System, predict_system
 from probewise.systems.forms import ReferenceFit, bind_forms, extract_stored_fit
 from probewise.systems.forms.formulas import formula_forms
-from probewise.systems.forms.modulations import origin_of_column
 
 EPOCH = 1.7e9  # s, a multiple of 2^-20 away from any of the times
-FAR = 2.0**21  # of a column
 N_ROWS = 60
 COUNTS_TIME = (
     "offset_drift", "gain_drift", "drifts:gain", "drifts:offset", "interference", "clock_drift", "periodic_forcing:s",
@@ -53,19 +51,6 @@ def _readings(about, form, setting):
     return about.system.chain(about.table, [form]).predict(theta, about.table)[0]
 
 
-def test_a_recording_that_begins_within_ten_of_its_lengths_is_counted_from_0():
-    assert origin_of_column(np.array([9.9, 10.9])) == 0.0
-    assert origin_of_column(np.array([-10.0, -9.0])) == 0.0
-    assert origin_of_column(np.array([10.5, 11.5])) == 10.5
-    assert origin_of_column(np.array([-20.0, np.nan, -19.0])) == -20.0
-    assert origin_of_column(np.array([-101.0, -91.0])) == 0.0  # by its near end, as one in front of 0 is
-    assert origin_of_column(np.array([91.0, 101.0])) == 0.0
-    assert origin_of_column(np.array([-1.0, 1000.0])) == 0.0
-    assert origin_of_column(np.array([7.0, 7.0])) == 0.0
-    assert origin_of_column(_table(0.0).time_s) == 0.0
-    assert origin_of_column(_table(EPOCH).time_s) == EPOCH
-
-
 @pytest.mark.parametrize("how", [_function, _law])
 def test_every_form_of_a_recording_by_the_epoch_is_that_of_the_same_recording_from_0(how):
     near, later = (_about(shift, 0.0, how) for shift in (0.0, EPOCH))
@@ -90,15 +75,6 @@ def test_every_formula_of_a_recording_by_the_epoch_is_that_of_the_same_recording
         setting = one.entries[len(one.entries) // 3, 0]
         readings = _readings(later, other, setting)
         np.testing.assert_allclose(readings, _readings(near, one, setting), atol=0.1 * 0.01, err_msg=one.name)
-
-
-def test_a_periodic_error_of_a_column_far_from_0_has_its_phase_from_there():
-    near, away = (_about(0.0, far, _function) for far in (0.0, FAR))
-    form, found = bind_forms(near)["periodic_error:drive"], bind_forms(away)["periodic_error:drive"]
-    least = _DRIVE.min()
-    for setting in ([0.1, 0.7, 0.4], [0.05, 0.31, -1.0]):
-        shifted = [*setting[:2], setting[2] - 2 * np.pi * least / setting[1]]  # that from 0 has it at 0
-        np.testing.assert_allclose(_readings(away, found, setting), _readings(near, form, shifted), atol=1e-8)
 
 
 @pytest.mark.parametrize(

@@ -21,17 +21,6 @@ def _rows(t=_T):
     return RunTable({"t": t, "y": _reading(t)}, time="t", run=None)
 
 
-@pytest.mark.parametrize("n", [1, 2, 3])
-def test_a_few_rows_are_enough_for_a_smooth_reading(n):
-    """A straight line of slope 2 from which the reading lags: 2 (t - tau + tau exp(-t / tau)), t since the start."""
-    since, tau = _T[:n] - _T[0], 0.3
-    line, setting = 2.0 * since[None], np.array([[tau, 1.0]])
-    expected = 2 * (since - tau + tau * np.exp(-since / tau))
-    np.testing.assert_allclose(lagged_readings(line, setting, _rows(_T[:n]))[0], expected, atol=1e-12)
-    late = delayed_readings(line, setting, _rows(_T[:n]))[0]
-    np.testing.assert_allclose(late, 2 * np.maximum(since - tau, 0), atol=1e-12)
-
-
 @pytest.mark.parametrize("tau", [0.01, 0.3, 2.0, 50.0])
 def test_a_smooth_reading_lags_as_its_differential_equation_says(tau):
     exact = solve_ivp(
@@ -48,25 +37,6 @@ def test_a_reading_that_is_held_between_rows_lags_by_the_share_of_each_gap():
     for gap, value in zip(np.diff(_T), x[1:], strict=True):
         expected.append(expected[-1] + (1 - np.exp(-gap / tau)) * (value - expected[-1]))
     np.testing.assert_allclose(lagged_readings(x[None], np.array([[tau, 0.0]]), _rows())[0], expected)
-
-
-@pytest.mark.parametrize("tau", [0.05, 0.7])
-def test_a_smooth_reading_is_delayed_between_its_rows(tau):
-    exact = _reading(np.maximum(_T - tau, _T[0]))
-    smooth, straight = delayed_readings(_reading(_T)[None], np.array([[tau, 1.0], [tau, 0.0]]), _rows())
-    np.testing.assert_allclose(smooth, exact, atol=3e-3)
-    np.testing.assert_allclose(straight, np.interp(np.maximum(_T - tau, _T[0]), _T, _reading(_T)), atol=1e-12)
-
-
-@pytest.mark.parametrize("smooth", [0.0, 1.0])
-def test_no_lag_and_no_delay_change_nothing_also_where_rows_share_a_time(smooth):
-    t = np.repeat(np.arange(5.0), 2)
-    table = RunTable({"t": t, "y": t}, time="t", run=None)
-    x = _RNG.normal(size=(1, 10))
-    for act in (lagged_readings, delayed_readings):
-        np.testing.assert_array_equal(act(x, np.array([[0.0, smooth]]), table), x)
-    assert np.isfinite(lagged_readings(x, np.array([[0.3, smooth]]), table)).all()
-    assert np.isfinite(delayed_readings(x, np.array([[0.3, smooth]]), table)).all()
 
 
 @pytest.mark.parametrize("act", [lagged_readings, delayed_readings])

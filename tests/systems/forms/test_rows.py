@@ -97,13 +97,3 @@ def test_only_a_column_that_drives_the_simulator_sorts_a_table_without_a_time():
     assert sorting_column(_prepared(_X[::-1]).apparatus.about) == "x"
     assert sorting_column(_prepared(_RNG.permutation(_X), number=number).apparatus.about) is None
     assert sorting_column(_prepared(time="t", t=number).apparatus.about) is None
-
-
-def test_a_jump_of_a_sorted_table_shows_in_the_column_and_says_so():
-    prepared = _prepared()
-    step = prepared.effects["offset_step"]
-    assert step.covariates == ("x", "row")
-    assert (
-        "rows are sorted by x: what jumps or wanders from row to row may change with x instead"
-        in prepared.recording.notes
-    )

@@ -16,7 +16,7 @@ from probewise.arm.nxt import (
     normalized_from_counts,
     percent_from_counts,
 )
-from probewise.errors import LinkError, LowBatteryWarning, ParameterError
+from probewise.errors import LinkError, ParameterError
 
 ALL_COAST = bytes.fromhex("04 FF" + 9 * " 00")
 
@@ -54,14 +54,6 @@ def test_a_flash_gives_a_reading_and_leaves_the_led_off_even_where_the_reading_f
     assert paper_brick.input[0] == 0
 
 
-def test_a_sensor_that_a_program_has_reset_is_set_up_again(brick, paper_brick, clock):
-    light = brick.light_sensor(1)
-    light.set_led(False)
-    paper_brick.input = [0, 0, 0.0]
-    assert light.read() == 500
-    assert paper_brick.input[:2] == [6, 0]
-
-
 def test_a_sensor_that_never_becomes_valid_is_told_of(paper_brick, clock):
     light = LightSensor(Link(paper_brick, clock=clock), 1, clock=clock)
     light.set_led()
@@ -85,17 +77,6 @@ def test_a_byte_of_a_reading_that_was_changed_on_its_way_changes_no_reading(bric
     assert normalized_from_counts(light.read()) == normalized_from_counts(500)
 
 
-def test_a_voltage_that_jumps_is_believed_when_it_is_told_twice(brick, paper_brick):
-    brick.battery_mv()
-    paper_brick.alter[len(paper_brick.commands)] = changed(4, 0x10)
-    assert brick.battery_mv() == 7412
-    paper_brick.millivolt = 6900
-    before = len(paper_brick.commands)
-    assert brick.battery_mv() == 6900
-    assert brick.battery_mv() == 6900
-    assert len(paper_brick.commands) - before == 3
-
-
 def test_a_voltage_that_is_another_every_time_is_told_of(brick, paper_brick):
     carry_out = paper_brick.carry_out
 
@@ -106,16 +87,6 @@ def test_a_voltage_that_is_another_every_time_is_told_of(brick, paper_brick):
     paper_brick.carry_out = wild
     with pytest.raises(LinkError, match="another battery voltage each of 6 times"):
         brick.battery_mv()
-
-
-def test_a_battery_below_6_volts_is_warned_of_once(brick, paper_brick):
-    paper_brick.millivolt = 6000
-    assert brick.battery_mv() == 6000
-    paper_brick.millivolt = 5990
-    with pytest.warns(LowBatteryWarning, match=r"the NXT's battery is at 5\.99 V, below 6 V: motors slow down"):
-        assert brick.battery_mv() == 5990
-    paper_brick.millivolt = 5980
-    assert brick.battery_mv() == 5980
 
 
 def test_the_brick_says_who_it_is_and_what_runs_on_it(brick, paper_brick):

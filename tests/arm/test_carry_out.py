@@ -19,7 +19,7 @@ from probewise.arm import (
     shipped_geometry_path,
 )
 from probewise.arm.carry_out import duration_s
-from probewise.errors import ParameterError, ReachError
+from probewise.errors import ReachError
 from probewise.recordings import paper_plan
 
 GEOMETRY = read_geometry(shipped_geometry_path())
@@ -63,18 +63,6 @@ def test_a_plan_that_the_arm_cannot_reach_moves_nothing(told):
     ):
         list(carry_out(told.arm, plan, origin_mm=(24.0, 20.0), ask=told.asked.append))
     assert not told.asked
-
-
-@pytest.mark.parametrize(("name", "value"), [("led", 0.0), ("height_mm", 8.0)])
-def test_what_the_arm_has_not_is_refused(told, name, value):
-    plan = thinned(paper_plan())
-    usual = {"led": 1.0, "height_mm": 14.0}[name]
-    column = np.full(len(plan), usual)
-    told.take(dataclasses.replace(plan, covariates={name: column}))
-    column = column.copy()
-    column[3] = value
-    with pytest.raises(ParameterError, match=f"the plan's {name} is {value}"):
-        told.take(dataclasses.replace(plan, covariates={name: column}))
 
 
 def test_what_a_plan_commands_stays_in_rows_that_are_read_after_a_resumption():

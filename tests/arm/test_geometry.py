@@ -6,10 +6,8 @@ import re
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from probewise.arm import Joint, read_geometry, shipped_geometry_path
+from probewise.arm import read_geometry, shipped_geometry_path
 from probewise.errors import FileError
 
 SHIPPED = read_geometry(shipped_geometry_path())
@@ -47,28 +45,6 @@ def test_inverse_kinematics_lead_back_by_the_arrows(geometry, height_mm):
     back = np.array([by_complex_numbers(geometry, *row) for row in angles[solved]])
     np.testing.assert_allclose(back[:, :2], GRID[solved], atol=1e-9)
     np.testing.assert_allclose(back[:, 2], height_mm, atol=1e-9)
-
-
-@pytest.mark.parametrize("geometry", [SHIPPED, RELATIVE], ids=["absolute", "relative"])
-def test_the_rise_with_each_angle_is_the_difference_quotient(geometry):
-    angles = np.random.default_rng(2).uniform(-3, 3, (50, 3))
-    for k in range(3):
-        step = 1e-6 * np.eye(3)[k]
-        quotient = (geometry.position_mm(angles + step) - geometry.position_mm(angles - step))[:, 2] / 2e-6
-        np.testing.assert_allclose(geometry.height_slopes_mm_rad(angles)[:, k], quotient, atol=1e-4)
-
-
-def test_a_base_may_reach_beyond_half_a_turn():
-    """The upper left corner is at +173 degrees, which this base reaches as -187."""
-    angles = SHIPPED.angles_rad(np.array([[30.0, 640.0]]), 60.0)
-    assert math.degrees(angles[0, 0]) == pytest.approx(math.degrees(math.atan2(60, -494)) - 360)
-
-
-@given(st.floats(-1.9, 1.4), st.sampled_from([-1, 0, 1]))
-def test_counts_and_angles_agree_to_half_a_count(angle_rad, side):
-    for joint in (SHIPPED.base, Joint(0, -12.0, 0.3, -2.0, 2.0, 0.01)):
-        counts = joint.counts_at(angle_rad, side)
-        assert abs(joint.angle_at(counts, side) - angle_rad) <= 0.5 / abs(joint.counts_per_rad) * (1 + 1e-9)
 
 
 # What a person may get wrong in the file, the line to spoil it with, and what is said.
@@ -117,11 +93,3 @@ def test_the_examples_hold_the_shipped_file():
     if not example.exists():
         pytest.skip("no examples beside an installed package")
     assert example.read_text() == shipped_geometry_path().read_text()
-
-
-@pytest.mark.parametrize(("stop_rad", "side", "counts"), [(1.1, 1, 447), (-1.0, -1, -407)])
-def test_the_count_at_a_stop_has_the_play_on_its_side(stop_rad, side, counts):
-    """7 turns of 180 / pi degrees for a radian: 401.07 counts, and half the play, 0.03 / 2, beyond the stop."""
-    joint = Joint(0, 7.0, 0.0, -1.0, 1.0, 0.03, stop_rad)
-    assert joint.stop_side == side
-    assert joint.stop_counts == counts

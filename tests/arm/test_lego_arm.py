@@ -84,22 +84,6 @@ def test_a_reading_is_taken_at_its_place_and_height(bench):
     assert not bench.paper.is_open
 
 
-def test_the_links_come_down_on_every_place(bench):
-    """The last command to a link lowers the sensor, that to the base turns it upwards, whatever way its gears turn."""
-    with bench.arm as arm:
-        for place in PLACES:
-            before = len(bench.paper.drives())
-            arm.go_down(*place)
-            last = {port: power for port, power, _ in bench.paper.drives()[before:]}
-            for k, joint in enumerate(bench.geometry.joints):
-                if joint.port in last:
-                    direction = np.sign(last[joint.port] * joint.gear_ratio)
-                    a_bit_on = np.tile(arm.angles_rad, (2, 1))
-                    a_bit_on[1, k] += 0.01 * direction
-                    heights = bench.geometry.position_mm(a_bit_on)[:, 2]
-                    assert direction == 1 if k == 0 else heights[1] < heights[0]
-
-
 @pytest.mark.parametrize("height_mm", [None, 20.0])
 def test_the_first_lowering_to_any_height_is_in_steps_that_a_person_confirms(bench, height_mm):
     seen = []
@@ -269,14 +253,6 @@ def test_the_guard_lets_a_joint_that_is_outside_come_back():
     limits.require_allowed_move(0, outside, outside + 30)
     with pytest.raises(ReachError):
         limits.require_allowed_move(0, outside, outside - 1)
-
-
-def test_the_seconds_that_a_reading_takes_grow_with_the_way(bench):
-    places = np.array([[300.0, 200.0], [320.0, 200.0], [900.0, 200.0], [-900.0, 0.0]])
-    seconds = bench.arm.travel_s(Pose(300.0, 200.0), places)
-    assert seconds.shape == (4,)
-    assert seconds[0] < seconds[1] < seconds[2]
-    assert np.isnan(seconds[3])
 
 
 def test_a_simulated_arm_takes_the_geometry_of_a_real_one():

@@ -33,16 +33,6 @@ def link(script, clock):
     script.finish()
 
 
-def test_what_another_program_left_on_the_line_is_no_answer(script, clock):
-    """The brick still answers a question that an earlier run asked, and died."""
-    script.coming = [(clock.now_s + after_s, bytes.fromhex(DARK)) for after_s in (-1.0, 0.1, 0.25)]
-    script.expect(BATTERY, (0.3, VOLTS))
-    script.expect(ASLEEP, (0.06, AWAKE))
-    script.expect(LIGHT, (0.06, BRIGHT))
-    assert Link(script, clock=clock).ask(read).normalized == 565
-    script.finish()
-
-
 AGAIN = (LIGHT, (0.06, BRIGHT))
 REFUSAL = "03 00 02 07 C0"
 TORN = [
@@ -135,15 +125,6 @@ def test_a_silent_brick_is_told_of_within_the_deadline(link, script, clock):
         link.ask(read)
 
 
-def test_a_question_that_is_refused_again_and_again_is_given_up(link, script, clock):
-    for _ in range(3):
-        script.expect(LIGHT, (0.06, REFUSAL))
-    before = clock.now_s
-    with pytest.raises(BrickError, match="C0"):
-        link.ask(read)
-    assert clock.now_s - before < 0.5
-
-
 def test_a_refused_move_is_not_sent_again(link, script):
     script.expect(MOVE, (0.06, "03 00 02 04 DE"))
     with pytest.raises(BrickError, match="DE"):
@@ -205,11 +186,3 @@ def test_a_brick_is_kept_awake_as_often_as_its_limit_needs(script, clock, limit,
         link.keep_awake()
         clock.sleep(waits_s[1])
     script.finish()
-
-
-def test_a_cut_line_is_an_error_at_once(link, script, clock):
-    script.cut_after = len(script.sent_at)
-    before = clock.now_s
-    with pytest.raises(LinkError, match="cut"):
-        link.ask(read)
-    assert clock.now_s - before < 0.1

@@ -23,15 +23,6 @@ def test_a_motor_comes_to_its_goal_from_the_same_side(motor, paper_brick, side):
         assert paper_brick.at_rest
 
 
-def test_a_motor_that_is_there_already_is_left_alone(motor, paper_brick):
-    motor.move_to(100, 1)
-    before = len(paper_brick.drives())
-    motor.move_to(101, 1)
-    assert len(paper_brick.drives()) == before
-    motor.move_to(101, -1)
-    assert len(paper_brick.drives()) > before
-
-
 def test_every_move_has_a_limit(motor, paper_brick):
     """The firmware's target is found without one: no dead line leaves a motor running."""
     paper_brick.motors[0].target = 5000  # as a program that ran before may have left it
@@ -47,26 +38,6 @@ def test_the_target_is_found_where_the_motor_stands(motor, paper_brick):
     assert not paper_brick.drives()
     assert paper_brick.motors[0].target == 70
     assert abs(motor.move_to(90, 1) - 90) <= 1
-
-
-def test_the_coast_is_learned_whatever_it_is(motor, paper_brick):
-    """A motor that runs on twice as far as first thought: once learned, two moves do."""
-    paper_brick.motors[0].coast = 1.0
-    for goal in (500, 1500, 700, 1800):
-        motor.move_to(goal, 1)
-    before = len(paper_brick.drives())
-    motor.move_to(3500, 1)
-    assert len(paper_brick.drives()) - before == 2
-
-
-def test_a_rough_move_takes_one_command(motor, paper_brick):
-    motor.move_to(0, 1)
-    motor.move_near(1000)
-    motor.move_near(0)
-    before = len(paper_brick.drives())
-    here = motor.move_near(1000)
-    assert len(paper_brick.drives()) - before == 1
-    assert abs(here - 1000) < 30
 
 
 @pytest.mark.parametrize("lost", ["command", "answer"])
@@ -88,13 +59,6 @@ def test_a_reset_makes_the_place_zero_and_the_target_is_still_known(motor, paper
     assert abs(motor.move_to(100, 1) - 100) <= 1
     assert paper_brick.motors[0].position == pytest.approx(600, abs=2)
     assert paper_brick.n_sought == before == 1
-
-
-def test_counters_that_somebody_else_set_back_are_noticed(motor, paper_brick):
-    motor.move_to(500, 1)
-    paper_brick.motors[0].zero = 400
-    assert abs(motor.move_to(300, 1) - 300) <= 1
-    assert paper_brick.n_sought == 2
 
 
 def changed(at, byte):

@@ -45,21 +45,6 @@ def entered(own, **options):
     return OwnInstrument(lambda: own, clock=Clock(), **options).__enter__()
 
 
-@pytest.mark.parametrize("found", [41.5, np.float32(41.5), np.array(41.5), {"value": 41.5}])
-def test_a_number_or_a_dict_with_a_value_is_a_reading_stamped_by_the_clock(found):
-    arm = entered(Own(found), start_s=50.0)
-    assert arm.measure(Pose(1.0, 2.0, 0.5)) == Reading(41.5, Pose(1.0, 2.0, 0.5), 51.0)
-
-
-def test_what_is_known_of_a_reading_takes_the_place_of_what_was_asked_for_and_the_rest_is_kept_as_covariates():
-    known = {"x_mm": 1.25, "orientation_rad": 0.1, "time_s": 7, "temperature_c": np.float64(21.5), "lux": math.nan}
-    reading = entered(Own({"value": 3, **known})).measure(Pose(1.0, 2.0, height_mm=9.0))
-    assert reading.pose == Pose(1.25, 2.0, 0.1, 9.0)
-    assert reading.time_s == 7.0
-    assert reading.covariates["temperature_c"] == 21.5
-    assert math.isnan(reading.covariates["lux"])
-
-
 BAD = {
     "nothing": (None, "what measure returned is None; allowed: a finite number, or a dict"),
     "a text": ("41", "what measure returned is '41'; allowed: a finite number"),
@@ -184,13 +169,6 @@ def test_an_error_in_closing_does_not_hide_what_went_wrong_before():
         pass
 
 
-def test_the_arms_of_this_package_are_taken_as_they_are():
-    arm = SimulatedArm(lambda pose, time_s, height_mm: 3.0)
-    assert as_instrument(arm) is arm
-    own = as_instrument(Own())
-    assert as_instrument(own) is own
-
-
 def file_of(folder, text):
     path = folder / "mine.py"
     path.write_text(text)
@@ -303,13 +281,6 @@ def test_a_sensor_that_somebody_may_have_turned_is_turned_back_where_that_matter
             read = list(carry_out(arm, plan(**changes), origin_mm=(0.0, 0.0), ask=asked.append))
     assert [reading.pose.orientation_rad for reading in read] == plan(**changes).orientation_rad.tolist()
     assert turns_asked(asked) == (angles * 2 if len(angles) == 2 else angles)
-
-
-def test_one_that_turns_its_sensor_and_lifts_it_is_told_where_to_and_nobody_is_asked():
-    asked, own = [], Own(turns=True, lifts=True)
-    taken(own, asked, plan(covariates={"height_mm": [10, 10, 14, 14]}), first=2)
-    assert len(asked) == 2
-    assert own.asked == [Pose(110.0, 50.0, math.pi / 3, 14.0)] * 2
 
 
 def test_where_it_knows_that_it_read_is_written_in_the_plans_frame():

@@ -61,16 +61,6 @@ def test_it_reads_where_the_head_has_come_to_and_lets_go_of_the_motors(bench):
     assert printer.obeyed[-1] == "M84"
 
 
-@pytest.mark.parametrize("faults", [{"garble": (1, 9)}, {"lose": (3, 8)}, {"garble": (7, 8, 9), "lose": (11, 13)}])
-def test_a_line_that_the_printer_asks_for_again_is_sent_again_and_obeyed_once(bench, faults):
-    with bench(**faults) as (printer, path), OwnInstrument.from_file(path) as arm:
-        assert arm.measure(Pose(120.0, 100.0)).value == 840.0
-        assert arm.measure(Pose(20.0, 100.0)).value == 140.0
-    moves = [command for command in printer.obeyed if command.startswith("G1 X")]
-    assert moves == ["G1 X120.00 Y100.00 F6000", "G1 X20.00 Y100.00 F6000"]
-    assert len(printer.received) == len(printer.obeyed) + sum(map(len, faults.values()))
-
-
 @pytest.mark.parametrize(
     ("faults", "said"),
     [

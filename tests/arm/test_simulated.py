@@ -1,33 +1,16 @@
 """The simulated arm as an instrument: reach, clock, scale."""
 
-import math
-
 import numpy as np
 import pytest
 
-from probewise.arm import Pose, Reach, Reading, ReadingScale, SimulatedArm, Speed, read_geometry, shipped_geometry_path
+from probewise.arm import Pose, Reach, ReadingScale, SimulatedArm, Speed
 from probewise.errors import ParameterError, ReachError, ShapeError
 
-GRID = np.stack(np.meshgrid(np.linspace(0, 1048, 131), np.linspace(0, 520, 65)), axis=-1).reshape(-1, 2)
 HERE = Pose(500.0, 200.0)
 
 
 def flat(value):
     return lambda pose, time_s, height_mm: value
-
-
-def test_the_simulated_arm_reaches_what_the_arm_that_ships_reaches():
-    """Two routes to one reach, a ring to the mm, and the joints of the shipped geometry with room for their motors."""
-    shipped, ring = read_geometry(shipped_geometry_path()), Reach()
-    away = np.hypot(*(GRID - ring.axis_mm).T)
-    apart = (abs(away - ring.nearest_mm) > 1) & (abs(away - ring.farthest_mm) > 1)
-    np.testing.assert_array_equal(ring.contains(GRID[apart]), shipped.contains(GRID[apart]))
-    assert shipped.sentence().startswith(Reach().sentence())
-
-
-def test_places_off_the_field_are_out_of_reach():
-    places = np.array([[524.0, 521.0], [-1.0, 400.0], [np.nan, 100.0], [np.inf, 100.0], [524.0, 300.0]])
-    np.testing.assert_array_equal(SimulatedArm(flat(1.0)).reachable(places), [False, False, False, False, True])
 
 
 @pytest.mark.parametrize("pose", [Pose(0.0, 0.0), Pose(-5.0, 300.0), Pose(np.nan, 1.0), Pose(500.0, 200.0, np.inf)])
@@ -37,19 +20,6 @@ def test_an_unreachable_pose_is_refused_with_what_is_allowed_and_the_arm_stays(p
     with pytest.raises(ReachError, match=r"126 to 755 mm from the arm's axis at \(524, 580\)|a finite orientation"):
         arm.measure(pose)
     assert (arm.pose, arm.time_s) == before
-
-
-def test_the_clock_is_advanced_by_travel_and_reading():
-    arm = SimulatedArm(
-        flat(50.0), speed=Speed(move_mm_s=50.0, read_s=2.0), last=Reading(50.0, Pose(500.0, 250.0), 100.0)
-    )
-    first = arm.measure(HERE)
-    second = arm.measure(Pose(530.0, 240.0))
-    third = arm.measure(Pose(530.0, 240.0))
-    assert second.time_s - first.time_s == pytest.approx(50 / 50 + 2)
-    assert third.time_s - second.time_s == pytest.approx(2.0)
-    assert first.time_s == pytest.approx(100 + 50 / 50 + 2)
-    assert arm.time_s == third.time_s
 
 
 def test_the_sensor_is_lowered_to_14_mm_and_told_when_and_where():
@@ -63,29 +33,6 @@ def test_the_sensor_is_lowered_to_14_mm_and_told_when_and_where():
     assert calls == [(HERE, reading.time_s, 14.0)]
     assert reading.pose == HERE
     assert reading.covariates == {"height_mm": 14.0}
-
-
-FINER, ENDS = ReadingScale(step=0.25), ReadingScale(step=None)
-
-
-@pytest.mark.parametrize(
-    ("value", "scale", "expected"),
-    [
-        *((value, {}, read) for value, read in ((33.4, 33), (33.6, 34), (0.2, 1), (-4, 1), (120, 100), (np.inf, 100))),
-        (33.37, {"scale": FINER}, 33.25),
-        (133.37, {"scale": ENDS}, 100),
-        (133.37, {"scale": None}, 133.37),
-    ],
-)
-def test_readings_are_whole_lego_units_from_1_to_100_or_of_another_scale(value, scale, expected):
-    """Paper, "Robotic Arm Test Bed": a scale of 1 to 100."""
-    assert SimulatedArm(flat(value), **scale).measure(HERE).value == expected
-
-
-def test_a_scale_ends_at_a_whole_step_or_at_its_end_and_what_is_missing_stays_so():
-    assert math.isnan(SimulatedArm(flat(math.nan)).measure(HERE).value)
-    assert ReadingScale(0.0, 10.0, 3.0).clip_and_round(10.0) == 9.0
-    assert ReadingScale(0.0, 11.0, 3.0).clip_and_round(11.0) == 11.0
 
 
 def test_leaving_the_block_brings_the_arm_to_rest_after_an_exception_too():

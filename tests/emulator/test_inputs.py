@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from probewise.emulator import Brick, LightSensor, VirtualClock, empty_port
+from probewise.emulator import Brick, VirtualClock, empty_port
 
 
 class Fixed:
@@ -57,16 +57,6 @@ def test_readings_are_invalid_for_20_ms_after_a_change_of_type_and_show_the_old_
     assert dark[0] == 1
     assert dark[3] == 28
     assert lit[3] == 57
-
-
-@given(percent=st.floats(0, 100))
-def test_what_is_seen_comes_back_in_percent(percent):
-    """One count of the converter is 0.147 %, and the firmware truncates."""
-    clock = VirtualClock()
-    ask = asking(light_brick(clock, LightSensor(lambda lit: percent, clock)))
-    ask("80 05 01 05 00")
-    clock.sleep(0.1)
-    assert values(ask)[2] * 100 / 1023 == pytest.approx(percent, abs=0.3)
 
 
 @given(telegrams=st.lists(st.binary(max_size=70), max_size=6))

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from probewise.emulator import Brick, Motor
+from probewise.emulator import Motor
 from probewise.emulator.motors import IDLE, OutputPort, OutputSetting
 
 RUN, COAST, HOLD = "07 01 00 20", "00 00 00 00", "00 07 01 00 20 00 00 00 00"
@@ -39,22 +39,6 @@ def test_a_coasting_motor_stops_where_the_integral_says():
     assert motor.speed_deg_s == 0
 
 
-def test_an_unregulated_motor_runs_at_the_speed_that_friction_leaves(ask, clock, brick):
-    turn(ask, 50, 0, how="01 00 00 20")
-    port = wait(clock, brick, 1.0)
-    motor = port.motor
-    expected = motor.full_speed_deg_s * 0.5 * 7412 / motor.rated_mv - motor.friction_deg_s2 * motor.driven_s
-    assert port.motor.speed_deg_s == pytest.approx(expected, rel=0.01)
-
-
-@pytest.mark.parametrize("battery_mv", [7412, 6500])
-def test_a_regulated_motor_keeps_ten_degrees_a_second_for_each_unit_of_power(clock, battery_mv):
-    brick = Brick(clock, full_mv=battery_mv)
-    brick.answer(bytes.fromhex(f"80 04 00 1E {RUN} 00 00 00 00"))
-    begun = wait(clock, brick, 2.0).tacho_count
-    assert wait(clock, brick, 4.0).tacho_count - begun == pytest.approx(1200, abs=15)
-
-
 def test_the_regulator_is_the_firmwares_by_hand():
     """Power is half of 3 e (to 100), the sum of errors (3 s + e) / 4, and the change of e, all in whole numbers."""
     port = OutputPort(Motor(stops_deg=(0.0, 0.0)))
@@ -79,40 +63,6 @@ def test_a_limited_run_overshoots_as_published_and_shows_idle_before_it_rests(as
     wait(clock, brick, 1.0)
     assert port.motor.speed_deg_s == 0
     assert 400 <= port.tacho_count <= 440
-
-
-def test_hold_brings_a_pushed_motor_back_and_coasting_does_not(ask, clock, brick):
-    ask(f"80 04 00 {HOLD}")
-    port = wait(clock, brick, 0.5)
-    port.motor.angle_deg += 20
-    port.motor.speed_deg_s = 1.0
-    assert abs(wait(clock, brick, 2.0).tacho_count) <= 3
-    ask(f"80 04 00 00 {COAST} 00 00 00 00")
-    port.motor.angle_deg += 20
-    assert wait(clock, brick, 2.0).tacho_count >= 17
-
-
-def test_overshoot_is_taken_off_the_next_run_in_the_same_direction(ask, clock, brick):
-    """The goal runs on from where the last run should have ended."""
-    for _ in range(2):
-        turn(ask, 75, 360)
-        port = wait(clock, brick, 2.0)
-    assert 720 + 40 <= port.tacho_count <= 720 + 80
-
-
-def test_a_motor_stands_still_at_its_stop():
-    motor = Motor(stops_deg=(-50.0, 100.0))
-    for _ in range(1000):
-        motor.step(1e-3, 80, brake=False, battery_mv=7400)
-    assert (motor.angle_deg, motor.speed_deg_s) == (100.0, 0.0)
-
-
-def test_what_hangs_on_a_motor_follows_when_the_play_is_used_up():
-    motor = Motor(play_deg=8.0)
-    for side in (1, -1):
-        while side * motor.angle_deg < 100:
-            motor.step(1e-3, 50 * side, brake=False, battery_mv=7400)
-        assert motor.driven_deg == pytest.approx(motor.angle_deg - side * 4.0)
 
 
 def test_the_brick_sleeps_unless_it_is_kept_awake(ask, clock, brick):

@@ -42,10 +42,6 @@ def answers(clock, faults, n=N):
     return got
 
 
-def test_a_link_without_faults_answers_everything_after_the_turnaround(clock):
-    assert all(a == ANSWER and s == pytest.approx(0.060) for a, s in answers(clock, Faults(), 50))
-
-
 @pytest.mark.parametrize(
     ("faults", "answered", "befallen", "rate"),
     [
@@ -59,23 +55,6 @@ def test_a_fault_befalls_its_share_of_replies_and_changes_nothing_else(clock, fa
     got = answers(clock, replace(faults, late_s=0.0))
     assert {answer for answer, _ in got} == answered
     assert likely(sum(befallen(answer, seconds) for answer, seconds in got), N, rate)
-
-
-def test_lateness_befalls_its_share_and_lasts_as_long_as_said(clock):
-    got = answers(clock, Faults(late=0.2, late_s=2.5))
-    assert all(a == ANSWER for a, _ in got)
-    late = [s for _, s in got if s > 1]
-    assert likely(len(late), N, 0.2)
-    assert late == pytest.approx([2.56] * len(late))
-
-
-def test_a_corrupted_reply_has_one_other_byte(clock):
-    """Anywhere in the frame, its length included."""
-    got = answers(clock, Faults(corrupt=0.2, late_s=0.0))
-    other = [[k for k, (a, b) in enumerate(zip(answer, ANSWER, strict=True)) if a != b] for answer, _ in got]
-    assert {len(places) for places in other} == {0, 1}
-    assert likely(sum(map(len, other)), N, 0.2)
-    assert {places[0] for places in other if places} == set(range(len(ANSWER)))
 
 
 def test_half_a_telegram_is_the_beginning_of_a_request_or_of_a_reply(clock):

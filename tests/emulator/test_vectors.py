@@ -4,7 +4,7 @@ import pytest
 
 from probewise.emulator import Brick, empty_port
 from probewise.emulator.motors import OutputSetting
-from probewise.emulator.protocol import COMMANDS, FrameAssembler, framed
+from probewise.emulator.protocol import FrameAssembler, framed
 
 
 class Fixed:
@@ -88,12 +88,6 @@ def test_output_state_is_laid_out_as_in_the_vectors(brick):
     assert exchanged(brick, "03 00 00 06 02") == (
         "19 00 02 06 00 02 D8 05 01 00 20 E8 03 00 00 85 FF FF FF 85 FF FF FF D7 11 00 00"
     )
-
-
-def test_no_error_of_a_command_without_reply_is_told(brick):
-    for opcode in COMMANDS:
-        kind = 0x81 if opcode >= 0x80 else 0x80
-        assert brick.answer(bytes((kind, opcode))) is None
 
 
 def test_frames_come_in_any_pieces():

@@ -62,6 +62,8 @@ BAD = {
         "a name in what measure returned is 'time_s'; allowed: .* time_s and pose of a Reading",
     ),
     "a Reading that is infinite": (Reading(math.inf, HERE, 1.0), "value of what measure returned is inf"),
+    "a time that no file takes": ({"value": 3, "time_s": 1e300}, "time_s of what measure returned is 1e"),
+    "a Reading far away": (Reading(1.0, Pose(1e12, 2.0), 1.0), r"x_mm of what .* is 1000000000000.0; .* up to 1e.09"),
     "a Reading nowhere": (Reading(1.0, Pose(math.nan, 2.0), 1.0), "x_mm of what measure returned is nan"),
 }
 

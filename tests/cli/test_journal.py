@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 
 import numpy as np
 import pytest
@@ -94,7 +95,7 @@ def test_a_journal_finds_its_sensor_where_results_took_its_place(named, journal_
         find_journal_sensor_file(journal_file)
 
 
-@pytest.mark.parametrize("harm", ["empty", "no reading", "other shape", "no field", "no options"])
+@pytest.mark.parametrize("harm", ["empty", "no reading", "other shape", "no field", "no options", "far away"])
 def test_a_journal_that_cannot_be_used_is_refused_in_one_line(harm, journal_file, sensor_file, tmp_path, capsys):
     first, *rest = journal_file.read_text().splitlines()
     settings = json.loads(first)
@@ -109,6 +110,8 @@ def test_a_journal_that_cannot_be_used_is_refused_in_one_line(harm, journal_file
             del settings["field"]
         case "no options":
             del settings["options"]
+        case "far away":
+            rest[0] = re.sub(r'"time_s": [^,]+', '"time_s": 1e300', rest[0])
     if harm != "empty":
         journal_file.write_text("\n".join([json.dumps(settings), *rest]) + "\n")
     arguments = ("diagnose", journal_file, "--sensor", sensor_file, "--out", tmp_path / "out")

@@ -26,7 +26,8 @@ from probewise.arm.lego import LegoArm
 from probewise.arm.simulated import SimulatedArm, Speed
 from probewise.errors import FileError, LinkError, ParameterError, ShapeError, message_of, require
 from probewise.recordings.columns import KNOWN, SESSION
-from probewise.recordings.io import in_this_directory, run_python_file
+from probewise.recordings.io import LARGEST, in_this_directory, run_python_file
+from probewise.recordings.table import LARGEST_PLACE_MM
 
 _A_READING = 'a finite number, or a dict such as {"value": 41.5, "time_s": 12.0, "temperature_c": 21.3}'
 _OF_THE_POSE = ("x_mm", "y_mm", "orientation_rad")
@@ -204,7 +205,9 @@ class OwnInstrument:
             there = dataclasses.replace(pose, **{name: own[name] for name in _OF_THE_POSE})
             reading = Reading(value, there, own["time_s"])
         for name, number in own.items():
-            checked_finite_number(f"{name}{_RETURNED}", number)
+            largest = LARGEST_PLACE_MM if name.endswith("_mm") else LARGEST
+            allowed = f"a finite number of magnitude up to {largest:g}"
+            require(abs(number) <= largest, f"{name}{_RETURNED}", number, allowed)
         return dataclasses.replace(
             reading, covariates={n: _checked_covariate(n, number) for n, number in known.items()}
         )
@@ -275,7 +278,9 @@ def _number(name: str, found: object, allowed: str = _A_READING, *, may_be_nan: 
 
 
 def _number_or_nan(name: str, found: object) -> float:
-    return _number(f"{name}{_RETURNED}", found, _OR_NAN, may_be_nan=True)
+    number = _number(f"{name}{_RETURNED}", found, _OR_NAN, may_be_nan=True)
+    require(not abs(number) > LARGEST, f"{name}{_RETURNED}", number, f"magnitudes up to {LARGEST:g}")
+    return number
 
 
 def _checked_covariate(name: object, number: object) -> float:

@@ -32,9 +32,10 @@ from probewise.arm.carry_out import recording_of
 from probewise.arm.instrument import Pose, Reading
 from probewise.effects import Effect, NoiseEffect
 from probewise.errors import FileError, ParameterError, shown
-from probewise.recordings.io import parse_json_file_text, read_bytes
+from probewise.recordings.io import LARGEST, is_number_of_file, parse_json_file_text, read_bytes
 from probewise.recordings.patterns import Pattern
 from probewise.recordings.plan import Instrumentation, Recording
+from probewise.recordings.table import LARGEST_PLACE_MM
 
 FORMAT = "journal/1"
 _SUMMARY_KEY = ', "belief": '
@@ -170,7 +171,7 @@ def _parse_entry(path: str | Path, line: Mapping[str, Any], row: int) -> Entry:
         column = "time_s"
         time_s = _parse_number(line["time_s"])
         column = "reading"
-        value = _nan_if_null(line["reading"])
+        value = _nan_if_null(line["reading"], math.inf)  # whose range its sensor has
         column = "covariates"
         covariates = {str(name): _nan_if_null(number) for name, number in line["covariates"].items()}
         column = "belief"
@@ -192,21 +193,21 @@ def _null_if_nan(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _nan_if_null(value: float | None) -> float:
-    return math.nan if value is None else _parse_number(value)
+def _nan_if_null(value: float | None, largest: float = LARGEST) -> float:
+    return math.nan if value is None else _parse_number(value, largest)
 
 
-def _parse_number(value: object) -> float:
-    """Return a JSON number as a float; raise TypeError for anything else, such as a text or a boolean."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise TypeError(f"{shown(value)} is no number")
+def _parse_number(value: Any, largest: float = LARGEST) -> float:
+    """Return a JSON number of moderate magnitude as a float; raise TypeError for anything else, such as a text."""
+    if not is_number_of_file(value, largest):
+        raise TypeError(f"{shown(value)} is no number of magnitude up to {largest:g}")
     return float(value)
 
 
 def _parse_pose(line: Mapping[str, Any]) -> Pose:
-    height_mm = line.get("height_mm")
-    place = (_parse_number(line["x_mm"]), _parse_number(line["y_mm"]), _parse_number(line["orientation_rad"]))
-    return Pose(*place, None if height_mm is None else _parse_number(height_mm))
+    height_mm, place = line.get("height_mm"), (line["x_mm"], line["y_mm"], line["orientation_rad"])
+    x_mm, y_mm, turn_rad = (_parse_number(value, LARGEST_PLACE_MM) for value in place)
+    return Pose(x_mm, y_mm, turn_rad, None if height_mm is None else _parse_number(height_mm, LARGEST_PLACE_MM))
 
 
 def _pose_as_json(pose: Pose) -> dict[str, float]:

@@ -129,14 +129,6 @@ def test_readings_separate_hypotheses_into_classes():
     assert both is None or both.expected_log_bayes_factor == pytest.approx(0.0, abs=1e-6)
 
 
-def test_lag_against_backlash_wants_the_other_way():
-    plan = paper_plan()
-    lag, play = rival("lag", 0.5, [0.5], plan), rival("backlash", 0.5, [0.84], plan)
-    asked = measurement_separating_rivals([lag, play], 0.4, plan, LightSensorApparatus())
-    assert asked is not None
-    assert "backwards" in asked.description or "forth and back" in asked.description
-
-
 def read_by(plan: Plan) -> np.ndarray:
     chain = Chain(SPOT, FixedLevels(0.0, 1.0), KnownScene(plan.patterns), ())
     return chain.predict(np.empty((1, 0)), plan)[0]
@@ -192,14 +184,6 @@ def test_readings_are_advised_only_where_a_question_is_open(lag, play, advised):
     assert asked is None or asked.expected_log_bayes_factor >= ENOUGH_NATS
 
 
-def test_aliases_that_no_reading_tells_apart_leave_nothing_to_advise():
-    plan = paper_plan()
-    fits = {("lag",): refit("lag", [0.5], plan), ("twin",): refit("lag", [0.5], plan)}
-    fits["twin",].names = ("twin",)
-    found = searched({("lag",): 0.49, ("twin",): 0.49, (): 0.02}, plan, fits)
-    assert choose_next_measurement(found, refit("lag", [0.0], plan), unknown_shows_in=None, is_unknown=False) is None
-
-
 def test_the_next_readings_of_an_unknown_effect_go_where_its_residuals_lie():
     plan = paper_plan()
     scan = plan.scan_names[1]
@@ -231,18 +215,6 @@ NULL = Model(cast(Any, ABOUT.system), (), cast(Any, TABLE))
 
 def rival_of_new_runs(model: Model, z: np.ndarray, root: float = 1e-9) -> Rival:
     return Rival("a", model, z, root * np.eye(len(z)), 0.5, APPARATUS.coordinates_of_new_run(model))
-
-
-def test_the_values_of_recorded_runs_tell_nothing_of_a_new_one():
-    """Rivals that start recorded runs differently, and agree on all else, differ in no run yet to be recorded."""
-    other = ABOUT.z + np.array([0.0, 0.0, 0.2, 0.2, 0.2])  # by a degree, twenty noise sds
-    rivals = [rival_of_new_runs(NULL, ABOUT.z), rival_of_new_runs(NULL, other)]
-    asked = measurement_separating_rivals(rivals, 0.05, cast(Any, TABLE), APPARATUS)
-    assert asked is None or asked.expected_log_bayes_factor < 0.5
-    known = [replace(r, of_run=np.zeros(0, dtype=np.int64)) for r in rivals]
-    would = measurement_separating_rivals(known, 0.05, cast(Any, TABLE), APPARATUS)
-    assert would is not None
-    assert would.expected_log_bayes_factor > 100
 
 
 def test_the_gain_of_the_heater_tells_as_much_as_a_run_with_its_own_start_can():

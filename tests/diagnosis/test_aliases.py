@@ -83,15 +83,6 @@ def test_the_advised_readings_add_three_nats_and_fewer_do_not(names):
     assert max(gained(s, fewer, *names) for s in SCANS) < 3
 
 
-@pytest.mark.parametrize(
-    "names", [("offset_drift", "drifts:start_c"), ("sensitivity:room_c", "depends:start_c:room_c")]
-)
-def test_no_readings_are_advised_for_effects_that_are_the_same(names):
-    alias = advised(*names)
-    assert (alias.settle_by, alias.readings) == (NOTHING, 0)
-    assert max(gained(scan, MOST_ADVISED_READINGS, *names) for scan in SCANS) < 0.01
-
-
 def test_a_value_per_run_separates_nothing_that_a_start_of_each_run_absorbs():
     """An offset of each run and a start of each run are the same in a new run too, which has one of each."""
     alias = advised("offset_per_run", "depends:start_c:room_c")

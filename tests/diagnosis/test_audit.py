@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -116,17 +115,6 @@ def test_only_what_the_apparatus_can_command_is_asked_for():
     assert kinds == {"repeat", "reverse", "respeed", "rotate"}
     able = replace(plan, instrumentation=replace(plan.instrumentation, controls=("led", "height_mm")))
     assert {command.kind for command in candidate_scans(able)} == {"repeat", "reverse", "respeed", "relight", "raise"}
-
-
-def test_a_sensor_whose_readings_fall_with_the_light_is_audited_like_another():
-    plan = thinned(two_way_plan(), 8)
-    names = ("a_1", "u_1", "v_1", "A_1", "B_1", "C_1", "I_min", "I_max")
-    theta = np.array([1.0, 0.5, 1.5, 0.03, 0.08, -0.005, 58.0, 11.0])
-    samples = theta + 1e-3 * np.random.default_rng(0).standard_normal((500, 8))
-    sensor = SimpleNamespace(names=names, samples=samples)
-    audit = audit_plan(plan, sensor=sensor, effects={"backlash": VOCABULARY["backlash"]})
-    assert audit.effects[0].detectability == "fine"
-    assert "noise 0.47 LEGO" in audit.assumed
 
 
 def test_another_noise_sd_shows_only_beside_a_calibrated_sensor():

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from probewise.diagnosis.samples import HypothesisSamples, ModelSamples, can_share_one_model, mix
+from probewise.diagnosis.samples import HypothesisSamples, ModelSamples, mix
 from probewise.diagnosis.search.hypotheses import HypothesisProbabilities
 from probewise.diagnosis.sensors import default_sensor
 from probewise.effects import RARE_EFFECTS, VOCABULARY, Extent
@@ -76,14 +76,6 @@ def test_hypotheses_are_mixed_by_their_probability_and_predict_what_each_does():
         expected = part.chain.predict(part.theta[own], PLAN)
         # Two quadratures: where a sample moves the sensor, straight edges are not taken together.
         np.testing.assert_allclose(predicted[rows], expected, atol=1e-6)
-
-
-def test_what_does_not_fit_into_one_model():
-    first, second = BUILT["scan_misplacement"].variants()[:2]
-    assert not can_share_one_model([first], [second])
-    assert can_share_one_model([first], [BUILT["lag"]])
-    assert can_share_one_model([BUILT["lag"]], [dataclasses.replace(BUILT["lag"])])
-    assert not can_share_one_model([SimpleNamespace(name="own", nothing=None)], [BUILT["lag"]])
 
 
 def candidate(names, log_z):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +12,6 @@ from scipy.stats import multivariate_normal
 
 from probewise.diagnosis import diagnose_system, repaired_of
 from probewise.diagnosis.diagnose_simulator import prepare_system
-from probewise.diagnosis.evidence import log_probability_effects_detectable
 from probewise.diagnosis.fit import Model, fit
 from probewise.diagnosis.noise import white_noise
 from probewise.diagnosis.templates import templates_of_effect
@@ -111,21 +109,6 @@ def test_every_probability_and_size_is_a_number(diagnosis_of_impossible):
         for place in diagnosis_of_impossible.where
         if place.start is not None
     )
-
-
-@pytest.fixture(scope="module")
-def shifted():
-    """The fit with the true shift of x, and its usable rows; without it the outer readings are impossible."""
-    prepared = prepare_system(DOME, table_for(DOME, TABLE))
-    model = Model(prepared.null, (prepared.effects["input_offset:x"],), prepared.recording.plan)
-    height_and_radius = ndtri([0.4, math.log(2.0) / math.log(10.0)])
-    start = np.append(height_and_radius, model.z_of_last_effect(np.array([[-0.5]]))[0])
-    return fit(model, prepared.recording, start, white_noise(N)), prepared.usable_rows
-
-
-def test_an_effect_without_which_readings_are_impossible_is_detectable(shifted):
-    found, usable = shifted
-    assert log_probability_effects_detectable(found, white_noise(N), usable) == pytest.approx(0.0, abs=1e-12)
 
 
 @pytest.mark.parametrize("noise", [{}, {"share": 0.1, "times": 5.0}, {"flat": 0.05, "sigma": SD_OF_IMPOSSIBLE}])

@@ -10,13 +10,12 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from scipy.special import log_ndtr, logsumexp
-from scipy.stats import multivariate_normal, norm
+from scipy.stats import norm
 
 from probewise.diagnosis.apparatus import PriorOdds
 from probewise.diagnosis.diagnose_simulator import prepare_system
 from probewise.diagnosis.evidence import (
     LEAST_VISIBLE,
-    held_out_gain,
     laplace_evidence,
     log_probability_effects_detectable,
     refined,
@@ -29,7 +28,6 @@ from probewise.effects import VOCABULARY, Extent, NoiseEffect
 from probewise.effects.noise import (
     correlated_noise,
     drifting_noise,
-    noise_sd,
     outliers,
     random_walk,
     signal_dependent_noise,
@@ -142,20 +140,6 @@ def test_refined_nodes_are_as_good_as_dense_ones(effect, noise):
     assert len(own.nodes.laws) <= 9
 
 
-def test_evidence_splits_into_the_calibrations_sd_and_another_of_some_factor():
-    """Beside outliers, whose name comes later: the factor is the first of the settings."""
-    found, recording = _found_with(2 * (WHITE * WIDE)[:400])
-    known = SdPrior(math.log(WHITE[:400].std()), SAME_SD, log_changed=-5.0)
-    whole = laplace_evidence(found, NoiseModel((outliers(),), recording, sd_prior=known))
-    same, changed = whole.by_sd(noise_sd())
-    assert np.logaddexp(same.log_z, changed.log_z - 5.0) == pytest.approx(whole.log_z)
-    assert changed.log_z > same.log_z + 50
-    assert [effect.name for effect in changed.noise.effects] == ["noise_sd", "outliers"]
-    drawn = changed.noise.effects[0].draws_about(changed.nodes.settings[:, :1], np.random.default_rng(1))
-    assert changed.weights @ drawn[:, 0] == pytest.approx(2.0, rel=0.2)
-    np.testing.assert_array_equal(changed.nodes.settings[:, 1:], whole.nodes.settings)
-
-
 def _mean_and_sd(evidence):
     mean = evidence.weights @ evidence.nodes.settings
     return mean, np.sqrt(evidence.weights @ (evidence.nodes.settings - mean) ** 2)
@@ -250,22 +234,3 @@ def test_the_evidence_of_one_offset_per_run_is_that_of_sums(case):
     assert gains[0] == pytest.approx(exact[0], abs=0.7)
     assert gains[1] == pytest.approx(exact[1], abs=3.0)
     assert (exact[0] > exact[1] + 3) == (case == "all differ")
-
-
-def test_a_run_held_out_is_expected_to_differ_as_much_as_the_others():
-    """Route two: normal values with the sd of the other runs' means, each run's readings together."""
-    rng = np.random.default_rng(7)
-    readings = _readings(rng.standard_normal(N_RUNS), 8)
-    recording, null, (shared, own) = _fitted(readings)
-    law, parts = white_noise_of_recording(recording), (_RUN, tuple(map(str, range(N_RUNS))))
-    found, apart = (held_out_gain(null, each, recording, law, parts, law_of_null=law) for each in (shared, own))
-    means = np.array([readings[k == _RUN].mean() for k in range(N_RUNS)])
-    exact = []
-    for name, _ in found.by_scan:
-        held, rest = readings[int(name) == _RUN], readings[int(name) != _RUN]
-        others = np.delete(means, int(name))
-        covariance = np.eye(N_EACH) + others.var(ddof=1) * (1 + 1 / len(others))
-        exact.append(multivariate_normal.logpdf(held, np.full(N_EACH, others.mean()), covariance))
-        exact[-1] -= norm.logpdf(held, rest.mean(), rest.std()).sum()
-    assert found.per_reading * found.n_readings == pytest.approx(sum(exact), abs=10)
-    assert found.per_reading > apart.per_reading

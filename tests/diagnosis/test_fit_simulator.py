@@ -11,7 +11,7 @@ import pytest
 
 from probewise.diagnosis import diagnose_system, fit_json, fit_simulator
 from probewise.diagnosis.diagnose_simulator import prepare_system
-from probewise.errors import NotConvergedError, ParameterError
+from probewise.errors import NotConvergedError
 from probewise.systems import Noise, Simulator, table_for
 
 X = np.linspace(-1.0, 1.0, 60)
@@ -101,13 +101,6 @@ def test_the_mode_is_that_which_nist_certifies_and_the_posterior_that_of_a_long_
         center, certified = (np.array([given[each][n] for n in found.names]) for each in ("value", "sd"))
         np.testing.assert_allclose((np.median(found.samples, axis=0) - center) / certified, median, atol=0.2 * max(sd))
         np.testing.assert_allclose(found.samples.std(axis=0) / certified, sd, rtol=0.15)  # some have heavy tails
-
-
-def test_one_reading_more_than_parameters_is_enough():
-    fit = fit_simulator(line(), {"x": X[::25], "y": Y[::25]}, rng=np.random.default_rng(1))
-    assert fit.fitted.mode() == pytest.approx({"a": 1.0, "b": 2.0}, abs=0.3)
-    with pytest.raises(ParameterError, match="usable readings is 2; allowed: 3 or more in column y"):
-        fit_simulator(line(), {"x": X[:2], "y": Y[:2]}, rng=np.random.default_rng(1))
 
 
 @pytest.mark.parametrize("n", [2, 3, 6, 11])

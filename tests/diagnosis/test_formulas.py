@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
 from probewise.diagnosis.diagnose_simulator import diagnose_system, prepare_system
 from probewise.diagnosis.diagnosis import diagnose_prepared
-from probewise.diagnosis.search import needs_more_than_memoryless_noise, search
-from probewise.diagnosis.search.hypotheses import HypothesisProbabilities
-from probewise.diagnosis.verdict import run_global_test
 from probewise.systems import RunTable, Simulator, table_for
 
 SD = 0.05
@@ -94,39 +88,3 @@ def test_a_product_beside_both_of_its_columns_is_what_remains():
     assert remainder.formula is not None
     low, high = remainder.formula.parameters[0].interval95
     assert low < 0.001 < high
-
-
-def test_products_are_of_time_and_the_columns_that_vary_most():
-    """A column of few values gives way; the reading, the run and what is predicted are no columns of a product."""
-    rng = np.random.default_rng(2)
-    more = {f"c{k}": rng.random(150) for k in range(8)} | {"bench": rng.integers(1, 4, 150).astype(float)}
-    prepared = _prepared_with_climate(lambda temp, damp: 0.0, **more)
-    found = search(prepared, depth=0).misfit_templates.covariates
-    assert {"level", "row", "run", "bench"} <= {c.name for c in found}
-    chosen = [c.name for c in prepared.apparatus.multiplied_covariates(found)]
-    assert chosen == ["x", "temp", "damp", *(f"c{k}" for k in range(7))]
-
-
-@pytest.mark.parametrize(
-    ("mean", "noise", "asked"),
-    [((), (), False), ((), ("outliers",), False), ((), ("random_walk",), True), (("lag",), (), True)],
-)
-def test_formulas_are_weighed_wherever_more_than_noise_without_a_memory_leads(mean, noise, asked):
-    """A walk takes up what changes slowly, and one name part of what a formula does."""
-    searched = SimpleNamespace(posterior=HypothesisProbabilities({(mean, noise): 0.95, (("drag",), ()): 0.05}))
-    assert needs_more_than_memoryless_noise(searched) is asked
-
-
-def test_a_formula_that_the_readings_proposed_is_no_test_of_them():
-    """A p-value that counts the best of hundreds of formulas, chosen by these readings, is too small."""
-    rng = np.random.default_rng(4)
-    x = rng.uniform(0.0, 1.0, 60)
-    simulator = Simulator("y", "V", {"a": (-5, 5)}, simulate=lambda p, u: p["a"] + 2.0 * u["x"])
-    table = table_for(simulator, {"x": x, "y": 1.0 + 2.0 * x + 0.4 * SD * np.cos(9 * x) + SD * rng.normal(size=60)})
-    prepared = prepare_system(simulator, table)
-    searched = search(prepared, depth=0)
-    formulas = prepared.apparatus.proposed_formulas()
-    assert len(formulas) > 5
-    more = replace(searched, prepared=replace(prepared, effects={**prepared.effects, **formulas}))
-    tests = [run_global_test(each, rng=np.random.default_rng(1)) for each in (searched, more)]
-    assert tests[0].p_value == tests[1].p_value

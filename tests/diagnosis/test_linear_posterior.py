@@ -37,24 +37,6 @@ def drawn(gains, seed):
     return found, samples.effect_samples("gain_per_run"), y
 
 
-def test_a_value_that_readings_fix_about_zero_is_as_certain_as_the_others():
-    """By numbers: the heavy-tailed prior times the normal likelihood of one run; the zero hardly matters."""
-    found, values, y = drawn([0.6, -0.5, 0.4, 0.0, -0.45, 0.5], seed=1)
-    (effect,) = found.model.effects
-    prior = effect.prior.marginals["values[3]"]
-    mine, zero = RUN == 3, found.model.theta(found.z[None, :])[0, 0]
-    signal = (2.0 * DRIVE + zero)[mine]
-    best, sd = signal @ (y[mine] - signal) / (signal @ signal), found.sd / np.sqrt(signal @ signal)
-    grid = np.linspace(best - 8 * sd, best + 8 * sd, 4001)
-    density = np.exp(prior.log_prob(grid) - 0.5 * ((grid - best) / sd) ** 2)
-    density /= density.sum()
-    mean = grid @ density
-    expected = np.sqrt((grid - mean) ** 2 @ density)
-    assert values[:, 3].std() == pytest.approx(expected, rel=0.2)
-    assert values[:, 3].mean() == pytest.approx(mean, abs=0.25 * expected)
-    assert 0.5 < values[:, 3].std() / values[:, 0].std() < 1.5
-
-
 @pytest.mark.parametrize("laplace_only", [False, True])
 def test_values_of_one_size_leave_open_what_they_have_in_common(laplace_only):
     """By numbers: a mean with a wide prior and values of one sd; given the sd, all are jointly normal."""

@@ -14,7 +14,7 @@ from scipy.stats import norm
 from probewise.diagnosis import diagnose
 from probewise.diagnosis.evidence import laplace_evidence
 from probewise.diagnosis.fit import Fit
-from probewise.diagnosis.noise import NoiseLaw, NoiseModel, Tail, log_prior_of_lost_value
+from probewise.diagnosis.noise import NoiseLaw, NoiseModel, log_prior_of_lost_value
 from probewise.effects import Extent
 from probewise.effects.noise import dropouts, outliers
 from probewise.recordings import Recording, paper_plan, two_way_plan
@@ -51,20 +51,6 @@ def test_the_misfit_is_minus_the_log_density(share, times):
     np.testing.assert_allclose(found, wanted)
 
 
-@pytest.mark.parametrize(("share", "times"), [(0.02, 8.0), (0.2, 2.5)])
-def test_pseudo_residuals_say_as_much_as_the_density_does(share, times):
-    """Their mean follows a shift of the noise one to one, and their variance is one over the information."""
-    rng = np.random.default_rng(3)
-    n = 400_000
-    z = rng.normal(size=n) * np.where(rng.random(n) < share, times, 1.0)
-    tail = Tail(share, times)
-    one = np.ones(1)
-    plain, moved = (tail.normal_pseudo_residuals((z + shift)[:, None], one)[:, 0] for shift in (0.0, 0.05))
-    assert np.mean(moved - plain) == pytest.approx(0.05, rel=0.02)
-    assert np.var(plain) == pytest.approx(1 / float(tail.fisher_information), rel=0.02)
-    assert np.abs(plain).max() < 10
-
-
 @pytest.mark.parametrize(("share", "times"), [(0.02, 8.0), (0.2, 2.5), (0.05, 30.0)])
 def test_the_scale_of_heavy_tailed_noise_is_at_the_peak_of_its_likelihood(share, times):
     """Also of noise whose tail is another; from a scale 1 % off it comes four times as close."""
@@ -76,22 +62,6 @@ def test_the_scale_of_heavy_tailed_noise_is_at_the_peak_of_its_likelihood(share,
         assert (law.minus_log_likelihood(z, factor * sigma) > best).all()
         again = law.whitened_density.likeliest_sigma(z, 50, start=factor * sigma)
         np.testing.assert_allclose(again, sigma, rtol=0.0025)
-
-
-def test_readings_lost_to_one_value_are_no_wide_ones():
-    rng = np.random.default_rng(5)
-    noise = SD * rng.normal(size=N)
-    lost = np.array([30, 90, 200, 310])
-    noise[lost] = -MEAN[lost]
-    found, recording = found_with(noise)
-    log_z = {
-        e.name: laplace_evidence(found, NoiseModel((e,), recording, least_sd=1e-6)).log_z
-        for e in (dropouts(), outliers())
-    }
-    plain = laplace_evidence(found, NoiseModel((), recording, least_sd=1e-6)).log_z
-    assert log_z["dropouts"] > log_z["outliers"] + 3 > plain + 50
-    law = laplace_evidence(found, NoiseModel((dropouts(),), recording, least_sd=1e-6)).likeliest_law
-    np.testing.assert_array_equal(np.flatnonzero(law.lost), lost)
 
 
 @pytest.mark.parametrize(("value", "lost"), [(0.0, True), (100.0, True), (37.0, False)])
@@ -117,27 +87,6 @@ def test_the_prior_of_what_is_lost_to_sums_to_one():
     others = 98 * math.exp(log_prior_of_lost_value(37.0, 100.0, (0.0, 100.0)))
     assert others + 2 * math.exp(log_prior_of_lost_value(100.0, 100.0, (0.0, 100.0))) == pytest.approx(1.0)
     assert log_prior_of_lost_value(100.0, 100.0, ()) == -math.log(100.0)
-
-
-class OfDeclaredSds(Recording):
-    """Readings of which each has a declared sd of its own."""
-
-    @property
-    def relative_sd(self):
-        return np.geomspace(0.25, 4.0, N)
-
-
-def test_lost_readings_are_found_where_every_reading_has_a_declared_sd_of_its_own():
-    """Their value is that of the readings, and no two residuals over their own sds agree."""
-    predicted = np.linspace(40.0, 60.0, N)
-    readings = predicted + 0.1 * np.geomspace(0.25, 4.0, N) * np.random.default_rng(0).standard_normal(N)
-    lost = [10, 21, 33, 160, 291]
-    readings[lost] = 12.1
-    recording = OfDeclaredSds(PLAN, readings)
-    model = NoiseModel((dropouts.for_extent(Extent.of(recording)),), recording, least_sd=1e-6)
-    nodes = model.nodes_for_predictions(predicted)
-    np.testing.assert_array_equal(nodes.settings[:, 1], 12.1)  # to the last digit
-    np.testing.assert_array_equal(np.flatnonzero(nodes.laws[0].lost), lost)
 
 
 @pytest.mark.slow

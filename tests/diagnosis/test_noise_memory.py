@@ -15,8 +15,6 @@ from probewise.diagnosis.evidence import predictive_log_densities
 from probewise.diagnosis.noise import (
     NoiseLaw,
     innovations_given_rest,
-    walk_given_readings,
-    whiten_under_each,
     with_known_wide_readings,
 )
 
@@ -83,16 +81,6 @@ def test_readings_left_out_of_a_chain_hand_their_correlation_on():
         assert taken.half_log_det() == pytest.approx(0.5 * np.linalg.slogdet(own)[1])
 
 
-def test_the_smoothed_walk_is_its_conditional_mean():
-    law, covariance = _laws()["walk"]
-    seen = ~law.lost
-    residuals = np.random.default_rng(5).normal(size=_N)
-    of_walk = covariance - np.diag(law.sd**2)
-    expected = of_walk[:, seen] @ np.linalg.solve(covariance[np.ix_(seen, seen)], residuals[seen])
-    np.testing.assert_allclose(walk_given_readings(law, residuals), expected)
-    assert not walk_given_readings(_laws()["ar"][0], residuals).any()
-
-
 N = 9
 OWN_SD = np.array([1.0, 0.7, 1.3, 1.0, 1.0, 0.8, 1.0, 1.2, 1.0])
 
@@ -149,25 +137,6 @@ def test_the_evidence_is_the_sum_over_all_sets_of_wide_readings(share, times, st
         wanted, wide = _by_enumeration(law, residuals, float(sigma[0]))
         assert log_density - known.half_log_det() + known.log_extra == pytest.approx(wanted, abs=0.06)
         np.testing.assert_allclose(known.wide, wide, atol=0.05)
-
-
-def test_many_distributions_are_worked_out_together_as_each_alone():
-    """Those of a tail beside a walk, which settle after different numbers of rounds, and whitening by each."""
-    rng = np.random.default_rng(6)
-    sd, lost = rng.uniform(0.5, 2.0, _N), np.arange(_N) == 4
-    walked = np.cumsum(rng.normal(size=_N)) + sd * rng.normal(size=_N) * np.where(np.arange(_N) % 9 == 0, 15.0, 1.0)
-    laws = [_law(share, times, step, sd) for share in (0.01, 0.2) for times in (3.0, 30.0) for step in (0.1, 1.0)]
-    laws += [replace(law, lost=lost) for law in laws]
-    together = with_known_wide_readings(laws, walked)
-    for law, own in zip(laws, together, strict=True):
-        (alone,) = with_known_wide_readings([law], walked)
-        np.testing.assert_array_equal(own.wide, alone.wide)
-        np.testing.assert_array_equal(own.sd, alone.sd)
-        assert own.log_extra == alone.log_extra
-    columns = rng.normal(size=(_N, 3))
-    ar = [_laws()[name][0] for name in ("ar", "white")]
-    for some in (together[:8], together, ar, [_laws()["ar in two runs"][0], ar[1]]):
-        np.testing.assert_array_equal(whiten_under_each(some, columns), [law(columns) for law in some])
 
 
 @pytest.mark.parametrize("far", [1e200, np.inf, np.nan])

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any, cast
-
 import numpy as np
 import pytest
 from scipy.stats import betabinom
 
 from probewise.diagnosis import diagnose
 from probewise.diagnosis.diagnose_simulator import prepare_system
-from probewise.diagnosis.evidence import Linearised, held_out_gain
-from probewise.diagnosis.fit import Fit, Model, fit
-from probewise.diagnosis.locate import Covariate, significant_places, window_columns
+from probewise.diagnosis.evidence import held_out_gain
+from probewise.diagnosis.fit import Model, fit
+from probewise.diagnosis.locate import Covariate, window_columns
 from probewise.diagnosis.noise import NoiseLaw, white_noise
-from probewise.diagnosis.outlying import clustering_log_bayes_factors, outlier_probabilities
+from probewise.diagnosis.outlying import clustering_log_bayes_factors
 from probewise.recordings import Recording, paper_plan
 from probewise.systems import Simulator, table_for
 from probewise.world.spots import Blob, gaussian_spot
@@ -26,35 +23,6 @@ TIME = np.arange(float(N))
 LOST = np.arange(N) % 4 == 1
 LAW = NoiseLaw(np.ones(N), np.zeros(N), LOST)
 WITHOUT = white_noise(int((~LOST).sum()))
-
-
-def fit_of_noise() -> tuple[Fit, Fit]:
-    """Make a fit of two coordinates to noise with a bump, and the same without the lost readings."""
-    rng = np.random.default_rng(3)
-    residuals = rng.standard_normal(N) + 2.0 * ((TIME >= 20) & (TIME < 32))
-    slopes = np.stack([np.full(N, 10.0), 0.1 * TIME], axis=1)
-    found = Fit(cast(Any, None), np.array([0.3, -0.2]), np.zeros(N), residuals, slopes, 1.0, 0.0)
-    kept = replace(found, predicted=found.predicted[~LOST], residuals=residuals[~LOST], slopes=slopes[~LOST])
-    return found, kept
-
-
-def test_lost_readings_change_neither_the_noise_sd_nor_the_significance_of_a_window():
-    found, kept = fit_of_noise()
-    problem, shorter = Linearised.of(found, LAW), Linearised.of(kept, WITHOUT)
-    assert problem.sd == pytest.approx(shorter.sd)
-    read = np.flatnonzero(~LOST)
-    (place,), (again,) = (
-        significant_places(
-            one,
-            [Covariate("time", TIME[read], rows)],
-            (),
-            fitted.residuals,
-            one.draw_null_residuals(400, rng=np.random.default_rng(0)),
-        )
-        for one, rows, fitted in ((problem, read, found), (shorter, np.arange(len(read)), kept))
-    )
-    assert (place.start, place.end) == (again.start, again.end)
-    assert place.z == pytest.approx(again.z)
 
 
 def test_lost_readings_change_no_density_of_held_out_readings():
@@ -83,10 +51,6 @@ N_OF_OUTLYING = 120
 PLACE = Covariate("place", np.linspace(-50, 50, N_OF_OUTLYING), np.arange(N_OF_OUTLYING))
 
 
-def tailed(n: int = N_OF_OUTLYING) -> NoiseLaw:
-    return NoiseLaw(np.ones(n), np.zeros(n), np.zeros(n, dtype=bool), share=0.05, times=6.0)
-
-
 def test_the_evidence_is_that_of_two_beta_binomials_against_one():
     """Of given numbers in and out of a window, the order within each being even."""
     far_out = np.zeros(N_OF_OUTLYING)
@@ -105,18 +69,6 @@ def test_the_evidence_is_that_of_two_beta_binomials_against_one():
 
 def _choose(n: int, k: int) -> float:
     return float(np.prod([(n - i) / (k - i) for i in range(k)])) if k else 1.0
-
-
-def test_what_is_in_the_tail_follows_bayes_rule():
-    law = tailed()
-    residuals = np.random.default_rng(2).standard_normal(N_OF_OUTLYING)
-    residuals[10] = 9.0
-    sigma = float(law.likeliest_sigma(law(residuals)[:, None])[0])
-    odds = (0.05 / 6) * np.exp(-0.5 * (residuals / sigma / 6) ** 2) / (0.95 * np.exp(-0.5 * (residuals / sigma) ** 2))
-    np.testing.assert_allclose(outlier_probabilities(residuals, law), odds / (1 + odds))
-    assert outlier_probabilities(residuals, law)[10] > 0.999
-    residuals[10] = 1e6  # where both densities are nothing
-    assert outlier_probabilities(residuals, law)[10] == 1.0
 
 
 def spotted(rows: np.ndarray) -> Recording:

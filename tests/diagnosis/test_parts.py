@@ -15,8 +15,8 @@ from probewise.diagnosis import templates as templates_module
 from probewise.diagnosis.evidence import LEAST_VISIBLE, SCALES, Linearised
 from probewise.diagnosis.fit import Fit, Model, effect_coordinates, effect_values
 from probewise.diagnosis.light_sensor import LightSensorApparatus, rows_as_next_scan
-from probewise.diagnosis.locate import Covariate, places_of_effect, significant_places
-from probewise.diagnosis.noise import NoiseLaw, noise_statistics, white_noise
+from probewise.diagnosis.locate import Covariate, places_of_effect
+from probewise.diagnosis.noise import NoiseLaw, white_noise
 from probewise.diagnosis.prepared import join, join_plans
 from probewise.diagnosis.search.hypotheses import Refits
 from probewise.diagnosis.sensors import default_sensor, sensor_from_samples, theta_to_natural, with_free_form
@@ -72,15 +72,6 @@ def test_sensor_coordinates_round_trip(n_gaussians):
     np.testing.assert_allclose(rho[:, 0], np.tanh(blocks[..., 4]))
 
 
-def test_an_amplitude_factor_changes_nothing():
-    """Only ratios of the a_n are identified."""
-    sensor = default_sensor(EXTENT, 2)
-    theta = sensor.theta(np.full((1, sensor.n_params), 0.3))
-    scaled = theta.copy()
-    scaled[:, [0, 6]] *= 7.0
-    np.testing.assert_allclose(theta_to_natural(scaled, 2), theta_to_natural(theta, 2))
-
-
 def test_an_earlier_posterior_becomes_the_prior_of_the_same_spread():
     sensor = default_sensor(EXTENT, 1)
     rng = np.random.default_rng(0)
@@ -106,25 +97,6 @@ def test_an_earlier_free_form_becomes_the_prior_of_the_same_spread():
     drawn = prior.theta(rng.normal(size=(4000, free.n_params)))
     spread = theta.std(axis=0)
     np.testing.assert_allclose(drawn.std(axis=0)[spread > 1e-9], spread[spread > 1e-9], rtol=0.08)
-
-
-@pytest.mark.parametrize("name", ["flicker", "albedo_patch", "scan_angle_error"])
-def test_templates_are_the_same_however_many_are_predicted_at_once(monkeypatch, name):
-    plan = two_way_plan()
-    model = Model(default_sensor(EXTENT, 1), (), plan)
-    z = np.full(model.n_params, 0.2)
-    usable = np.arange(len(plan))
-    found = Fit(model, z, model.predict(z[None, :])[0], np.zeros(len(plan)), np.zeros((len(plan), 7)), 1.0, 0.0)
-    effect = VOCABULARY[name].for_extent(EXTENT).with_fewer_variants()
-    whole = templates_of_effect(found, effect, usable)
-    monkeypatch.setattr("probewise.diagnosis.templates.AT_ONCE", 5 * len(plan))
-    few = templates_of_effect(found, effect, usable, most=7)
-    assert (len(few.columns), len(few.choice)) == (7, 7)
-    at = np.linspace(0, len(whole.columns) - 1, 7).round().astype(int)
-    for k, own in enumerate(at):
-        np.testing.assert_array_equal(few.settings[k], whole.settings[own])
-        np.testing.assert_allclose(few.columns[k], whole.columns[own], atol=1e-8)  # the error of a response
-        assert few.variant_of_entry(k) == whole.variant_of_entry(own)
 
 
 def test_templates_of_a_variant_are_what_its_scans_change():
@@ -248,44 +220,6 @@ def test_the_refit_of_a_null_under_the_simplest_noise_serves_the_nulls_that_are_
     assert refits.null_under_simplest_noise(weighed(-11.0)) is refits.plain[0]
 
 
-def test_what_survives_of_a_template_is_what_no_parameter_takes_up():
-    """Route one: products with the fit's basis; route two: each template's columns, less their fit by least squares."""
-    rng = np.random.default_rng(7)
-    n, p = 50, 3
-    slopes = rng.normal(size=(n, p))
-    templates = [slopes[:, :1] + 0.1 * rng.normal(size=(n, 1)), rng.normal(size=(n, 2)), 3.0 * slopes[:, 1:2]]
-    basis, _ = np.linalg.qr(np.concatenate([slopes, np.zeros((p, p))]))
-    problem = Linearised(basis, np.zeros(n + p), white_noise(n), 1.0, n)
-    wanted = []
-    for columns in templates:
-        unit = columns / np.linalg.norm(columns, axis=0)
-        left = unit - slopes @ np.linalg.lstsq(slopes, unit)[0]
-        wanted.append(np.linalg.norm(left) / np.linalg.norm(unit))
-    np.testing.assert_allclose(
-        TemplateBank.of(templates, ["a", "b", "c"]).unabsorbed_shares(problem), wanted, atol=1e-7
-    )
-
-
-@pytest.mark.parametrize("unit", [1.0, 1e12])
-def test_a_bump_is_found_where_it_is(unit):
-    """In noise sds, whatever the unit of the readings."""
-    n, rng = 200, np.random.default_rng(0)
-    time = np.arange(n, dtype=float)
-    r = rng.normal(size=n) + 2.0 * ((time >= 60) & (time < 75))
-    basis, _ = np.linalg.qr(np.concatenate([np.ones((n, 1)) * 100, np.eye(1)]))
-    augmented = np.concatenate([r, [0.0]])
-    problem = Linearised(basis, augmented - basis @ (basis.T @ augmented), white_noise(n), unit, n)
-    covariates = [Covariate("time", time, np.arange(n)), Covariate("level", rng.normal(size=n), np.arange(n))]
-    found = significant_places(problem, covariates, ("s",), r, problem.draw_null_residuals(400, rng=rng))
-    assert found[0].covariate == "time"
-    assert found[0].start == pytest.approx(60, abs=8)
-    assert found[0].end == pytest.approx(75, abs=8)
-    assert found[0].p_value < 0.01
-    assert found[0].figure_name == "witness_time.svg"
-    np.testing.assert_array_equal(found[0].values, time)
-    assert found[0].curve_mean.max() > 1.0
-
-
 def test_an_effect_is_where_it_has_half_its_strength():
     """Along the scan that it was seen in, not along the one that went across it."""
     x_mm, there = np.arange(-50.0, 51.0), np.zeros(101)
@@ -302,43 +236,15 @@ def test_an_effect_is_where_it_has_half_its_strength():
     assert found.end == pytest.approx(10 + half, abs=1)
 
 
-def test_what_sets_in_at_a_level_is_at_what_would_be_read_without_it():
-    """Readings from 10 to 60 that never rise above 50: a model without a ceiling, fitted to them, tops at some 52."""
-    without = np.linspace(10.0, 60.0, 101)
-    change = np.minimum(without, 50.0) - without
-    level = Covariate("level", np.minimum(without, 52.0), np.arange(101))
-    effect = VOCABULARY["saturation"].for_extent(EXTENT)
-    plan = line(101, scans=1).plan
-    (found,) = placed(effect, change, without, plan, [level])
-    assert found.covariate == "level"
-    assert found.without_effect
-    np.testing.assert_array_equal(found.values, without)
-    assert found.start == pytest.approx(50.5, abs=0.6)
-    assert found.end == pytest.approx(60.0, abs=1e-9)
-
-
 def test_an_effect_of_one_mounting_is_in_the_scans_that_feel_it_the_strongest_first():
     """A scan over white looks the same from any angle: nothing shows there, though its mounting is turned too."""
     plan = line(6, scans=3).plan
     scan = Covariate("scan", np.repeat([0.0, 1.0, 2.0], 6), np.arange(18), groups=True)
-    effect = replace(VOCABULARY["scan_angle_error"].for_extent(EXTENT), where=Where(scans=plan.scan_names))
+    effect = VOCABULARY["scan_angle_error"].for_extent(EXTENT)
+    effect = replace(effect, binding=replace(effect.binding, where=Where(scans=plan.scan_names)))
     change = np.repeat([0.5, 0.001, -2.0], 6)
     found = placed(effect, change, 0 * change, plan, [scan])
     assert [place.scan for place in found] == ["s2", "s0"]
-
-
-def test_noise_statistics_see_memory_tails_and_level():
-    rng = np.random.default_rng(0)
-    n = 2000
-    level = np.linspace(0, 1, n)
-    plain = rng.normal(size=n)
-    memory = np.convolve(plain, [1, 0.5], mode="same")
-    tails = rng.standard_t(3, size=n)
-    louder = plain * (1 + 3 * level)
-    lag, kurtosis, tilt = noise_statistics(np.stack([plain, memory, tails, louder], axis=1), np.arange(n) - 1, level)
-    assert abs(lag[0]) < 0.1 < lag[1]
-    assert abs(kurtosis[0]) < 0.5 < kurtosis[2]
-    assert abs(tilt[0]) < 5 < tilt[3]
 
 
 def test_joined_recordings_keep_scans_and_patterns_apart():
@@ -440,15 +346,6 @@ def test_recordings_of_other_heights_are_joined_each_at_its_own():
     assert other_way.instrumentation.height_mm == 20.0
     np.testing.assert_array_equal(other_way.covariates["height_mm"][len(second) :], 14.0)
     assert "height_mm" not in join([low, replace(low, readings=low.readings + 0.1)]).plan.covariates
-
-
-def test_a_flat_surface_read_alike_from_another_angle_or_in_the_dark_is_another_recording():
-    flat = replace(line(), readings=np.full(24, 42.0))
-    turned = replace(flat, plan=replace(flat.plan, orientation_rad=np.full(24, 1.5)))
-    dark = replace(flat, plan=replace(flat.plan, covariates={"led": np.zeros(24)}))
-    assert len(join([flat, turned, dark])) == 72
-    with pytest.raises(ParameterError, match="these are the same"):
-        join([flat, turned, replace(turned, source="copy.csv")])
 
 
 def test_recordings_of_other_units_are_not_joined():

@@ -10,7 +10,6 @@ import pytest
 from probewise.diagnosis.noise import NoiseLaw
 from probewise.diagnosis.posterior import (
     draw_by_annealing,
-    importance_resample,
     log_likelihood_marginal_over_sigma,
     quadratic_predictions,
     surrogate_log_density,
@@ -45,41 +44,6 @@ def test_a_bent_density_keeps_its_moments():
         assert abs(np.mean(found) - value) < 4 * np.std(found, ddof=1) / np.sqrt(20) + 0.02
 
 
-def test_weights_do_where_enough_of_them_count():
-    """The density wanted is half as wide, its mean an sd aside; of more samples than wanted as many as it takes."""
-
-    def log_p(z):
-        return -2.0 * np.sum((z - 0.5) ** 2, axis=1)
-
-    weighed = []
-
-    def counted(z):
-        weighed.append(len(z))
-        return log_p(z)
-
-    means, spreads = [], []
-    for seed in range(20):
-        rng = np.random.default_rng(seed)
-        first, log_q = normal(np.zeros(3), np.eye(3), 5000, rng)
-        z = importance_resample(first, log_q, counted, n_wanted=500, rng=rng)
-        assert z.shape == (500, 3)
-        means.append(z.mean(axis=0))
-        spreads.append(z.var(axis=0))
-    assert max(weighed) < 4000
-    # Of 250 that count each: four errors of the mean of twenty runs in three parameters, one false alarm in 5,000.
-    assert np.abs(np.mean(means, axis=0) - 0.5).max() < 4 * 0.5 / np.sqrt(20 * 200)
-    assert np.abs(np.mean(spreads, axis=0) - 0.25).max() < 4 * 0.25 * np.sqrt(2) / np.sqrt(20 * 200)
-
-
-def test_weights_are_refused_where_too_few_count():
-    rng = np.random.default_rng(1)
-    first, log_q = normal(np.zeros(8), np.eye(8), 1000, rng)
-    assert (
-        importance_resample(first, log_q, lambda z: -50 * np.sum((z - 1) ** 2, axis=1), n_wanted=500, rng=rng) is None
-    )
-    assert importance_resample(first, log_q, lambda z: np.full(len(z), -np.inf), n_wanted=500, rng=rng) is None
-
-
 CENTER = np.array([0.3, -0.2, 1.0])
 STEPS = np.array([[0.4, 0.1, 0.0], [0.0, 0.3, -0.2], [0.0, 0.0, 0.5]])
 PLACES = np.linspace(0.0, 3.0, 40)
@@ -112,26 +76,6 @@ def noisy(sd, seed=5, law=LAW):
 
 def about_the_center(e):
     return curve(CENTER + e @ STEPS)
-
-
-def test_what_is_quadratic_is_met_everywhere():
-    rng = np.random.default_rng(3)
-    slopes, bends = rng.standard_normal((3, 40)), rng.standard_normal((3, 3, 40))
-
-    def predict(e):
-        return 2.0 + e @ slopes + np.einsum("ni,nj,ijk->nk", e, e, bends)
-
-    e = rng.standard_normal((50, 3))
-    np.testing.assert_allclose(predicted(quadratic_predictions(predict, 3, 1e-9), e), predict(e), atol=1e-8)
-
-
-@pytest.mark.parametrize("sd", [0.01, 1.0])
-def test_what_makes_no_difference_is_left_out(sd):
-    """All readings together, what is left out is less than a fiftieth of the noise for each of the nine terms."""
-    full, thin = quadratic_predictions(about_the_center, 3, 1e-9), quadratic_predictions(about_the_center, 3, sd)
-    assert len(thin[2]) < len(full[2]) <= 9
-    one = np.eye(3)
-    assert np.linalg.norm(predicted(full, one) - predicted(thin, one), axis=1).max() < 9 * 0.02 * sd
 
 
 def test_the_density_is_that_of_its_predictions():

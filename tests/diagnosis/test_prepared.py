@@ -13,7 +13,7 @@ from probewise.calibration import predict
 from probewise.diagnosis import SensorAndShape, audit_plan, diagnose
 from probewise.diagnosis.apparatus import Apparatus
 from probewise.diagnosis.light_sensor import LightSensorApparatus
-from probewise.diagnosis.prepared import positions_in_stretches, prepare, rows_to_diagnose
+from probewise.diagnosis.prepared import prepare, rows_to_diagnose
 from probewise.diagnosis.samples import ModelSamples
 from probewise.effects import VOCABULARY, Extent
 from probewise.priors import Normal, Product
@@ -29,15 +29,6 @@ def recording(n=408):
     plan = paper_plan()
     readings = 30.0 + np.sin(plan.x_mm)
     return Recording(plan, readings).take(np.arange(n))
-
-
-def test_effects_are_those_that_could_show_here():
-    prepared = prepare(recording(), apparatus=SENSOR)
-    assert "backlash" in prepared.effects
-    assert "arm_knock" in prepared.effects  # out of vocabulary, by its formula
-    assert "orientation_error" not in prepared.effects  # the SSF takes it up
-    assert prepared.noise_effect_names >= {"outliers", "drifting_noise"}
-    assert not prepared.is_thinned
 
 
 def test_a_covariate_that_is_the_reading_in_another_unit_is_left_out_but_not_what_was_commanded():
@@ -63,13 +54,6 @@ def test_readings_too_far_out_for_noise_are_left_out_and_scale_nothing(lost, ste
     known = prepared.effects["dropouts"].known
     assert (known is None) == (not lost)
     assert known is None or known[1] in lost.values()
-
-
-def test_too_little_is_few_readings_or_equal_ones():
-    whole = recording()
-    assert not prepare(whole, apparatus=SENSOR).has_too_little_data
-    assert prepare(recording(20), apparatus=SENSOR).has_too_little_data
-    assert prepare(replace(whole, readings=np.full(408, 5.0)), apparatus=SENSOR).has_too_little_data
 
 
 def test_a_sensor_of_another_height_reads_the_plan_at_the_height_it_declares():
@@ -149,16 +133,3 @@ def test_places_of_a_thinned_recording_are_drawn_over_all_of_it_and_scans_have_t
     np.testing.assert_array_equal(covariate_values(found, scan)[rows], whole.plan.scan[rows])
     assert np.isfinite(covariate_values(found, scan)).sum() == len(rows)
     np.testing.assert_array_equal(scan.curve_at, np.unique(whole.plan.scan[rows]))
-
-
-@pytest.mark.parametrize("interleaved", [False, True])
-def test_a_stretch_lies_in_one_run(interleaved):
-    n_runs, length = 37, 271
-    run = np.arange(n_runs * length) % n_runs if interleaved else np.repeat(np.arange(n_runs), length)
-    chosen = positions_in_stretches(run, 2400)
-    assert 2300 < len(chosen) <= 2400
-    for k in range(n_runs):
-        place = np.flatnonzero(np.isin(np.flatnonzero(run == k), chosen))
-        streaks = np.diff(np.concatenate([[-1], np.flatnonzero(np.diff(place) != 1), [len(place) - 1]]))
-        assert len(streaks) > 5
-        assert streaks.min() >= 6

@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from itertools import combinations
-from types import SimpleNamespace
-from typing import Any, cast
 
 import pytest
 
 from probewise.diagnosis import PriorOdds
-from probewise.diagnosis.simulator_rows import SimulatorApparatus
 from probewise.effects import RARE_EFFECTS, VOCABULARY, Extent
 from probewise.recordings import two_way_plan
 from probewise.sensor import Stage
 
-OF_NO_LAW = SimpleNamespace(about=SimpleNamespace(states_with_rates_by_definition=frozenset()))
 EXTENT = Extent(10.0, 60.0, two_way_plan())
 EFFECTS = {**VOCABULARY, **RARE_EFFECTS}
 
@@ -29,28 +24,3 @@ def test_everything_about_the_mean_sums_to_one_but_for_what_is_unknown_beside():
     total += sum(math.exp(odds.log_prior_on_mean(names)) for k in range(4) for names in combinations(named, k))
     total += sum(math.exp(odds.log_prior_on_mean((name,))) for name in RARE_EFFECTS)
     assert total == pytest.approx(1.0, abs=1e-9)
-
-
-def test_of_one_wave_two_are_likelier_than_it_beside_another_effect_and_all_sums_to_one():
-    """Of three effects of which one may occur twice, counted by hand: seven sets, four of them with the wave."""
-    odds = PriorOdds(n_named=3, n_unnamed=0, by_size=(0.3, 0.03, 0.01), twice=0.1, twofold=frozenset({"wave"}))
-    names = ["drift", "wave", "lag"]
-    sets = [of for k in range(1, 4) for of in combinations(names, k)]
-    twice = [(*of, "wave~again") for of in sets if "wave" in of]
-    assert sum(math.exp(odds.log_prior_on_mean(of)) for of in [*sets, *twice]) == pytest.approx(0.34)
-    assert math.exp(odds.log_prior_on_mean(("wave", "wave~again"))) == pytest.approx(0.1 * 0.1)
-    assert odds.log_prior_on_mean(("wave", "wave~again")) > odds.log_prior_on_mean(("drift", "wave"))
-    as_any = PriorOdds(n_named=3, n_unnamed=0, by_size=(0.3, 0.03, 0.01), twofold=frozenset({"wave"}))
-    assert as_any.log_prior_on_mean(("wave", "wave~again")) == as_any.log_prior_on_mean(("drift", "wave"))
-
-
-def test_every_noise_sums_to_one():
-    odds = replace(SimulatorApparatus.prior_odds(cast(Any, OF_NO_LAW), {}), n_noises=5)
-    sets = (names for k in range(4) for names in combinations("abcde", k))
-    assert sum(math.exp(odds.log_prior_on_noise(names)) for names in sets) == pytest.approx(1.0)
-
-
-def test_single_effects_of_a_vocabulary_without_any_on_the_mean_leave_clean_and_unknown():
-    priors = PriorOdds(n_named=0).single_effect_priors([], ())
-    assert set(priors) == {((), ()), (("unknown",), ())}
-    assert sum(priors.values()) == pytest.approx(1.0)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from probewise.diagnosis.apparatus import Words
-from probewise.diagnosis.verdict import Grounds, Hypothesis, Judged, covariate_of_unknown, reason_of
+from probewise.diagnosis.verdict import Grounds, Hypothesis, Judged, reason_of
 
 OVEN = Words(null="the oven's law", find_signal="switch the heater on", settles_nothing="no reading tells them apart")
 GROUNDS = Grounds(OVEN, 100, 24, sentences={"lag": "the probe follows with 8 s", "step": "it jumps by 2 at 40 s"})
@@ -146,16 +146,3 @@ SAID = [
 @pytest.mark.parametrize(("judgement", "grounds", "sentence"), SAID)
 def test_a_judgement_is_said_in_one_sentence_of_the_apparatus_own_words(judgement, grounds, sentence):
     assert reason_of(judgement, replace(GROUNDS, **grounds)) == sentence
-
-
-def test_an_unknown_effect_shows_in_a_control_rather_than_in_time():
-    assert covariate_of_unknown("time, locally", ["power_w", "time"]) == "power_w"
-    assert covariate_of_unknown("time, locally", ["time"]) == "time"
-    assert covariate_of_unknown("level, locally", ["time", "level"]) == "level"
-
-
-def test_what_a_person_has_named_is_not_capitalised():
-    words = replace(OVEN, own_names=frozenset({"conc"}))
-    assert words.as_sentence("conc is off by 2") == "conc is off by 2"
-    assert words.as_sentence("rv_mps oscillates") == "rv_mps oscillates"
-    assert words.as_sentence("concentration is off") == "Concentration is off"

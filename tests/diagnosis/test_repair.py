@@ -44,16 +44,6 @@ def repair(absent=None, residuals=(1.0, np.nan)):
     )  # fmt: skip
 
 
-def test_a_repair_that_predicts_the_same_changes_nothing():
-    assert not repair().repair_changes_predictions
-    assert repair(residuals=(0.5, np.nan)).repair_changes_predictions
-
-
-def test_what_samples_lack_is_left_open_in_its_share():
-    marks = {"lag": np.array([False, False, True, False]), "step": np.array([True, True, True, False])}
-    assert repair(marks).combination_shares == {("lag",): 0.5, (): 0.25, ("lag", "step"): 0.25}
-
-
 def test_a_model_with_a_formula_in_half_of_its_samples_is_not_said_to_lack_the_correction():
     assert repair().not_in_model == "sensor.json does not contain it"
     formula = "formula:reading:y:x^2"

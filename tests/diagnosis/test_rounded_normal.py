@@ -6,20 +6,16 @@ import dataclasses
 
 import numpy as np
 import pytest
-from scipy.integrate import quad
 from scipy.special import logsumexp
 from scipy.stats import norm
 
 from probewise.diagnosis import diagnose
 from probewise.diagnosis.apparatus import PriorOdds
-from probewise.diagnosis.diagnose_simulator import prepare_system
-from probewise.diagnosis.noise import NoiseLaw, NoiseModel, RoundedNormal, SdPrior, rough_sd
-from probewise.diagnosis.search import noise_sd_about_given_null
+from probewise.diagnosis.noise import NoiseLaw, NoiseModel, SdPrior
 from probewise.diagnosis.search.hypotheses import NoiseModels
 from probewise.effects import VOCABULARY, Extent
 from probewise.recordings import Recording, paper_plan
 from probewise.sensor import Stage
-from probewise.systems import Noise, Simulator, table_for
 from probewise.world import concealed as hidden
 from probewise.world.spots import Blob, gaussian_spot
 from probewise.world.world import World
@@ -64,24 +60,6 @@ def test_a_rounded_reading_has_the_probability_of_its_cell():
     assert found - 0.5 * law.n_kept * np.log(2 * np.pi) == pytest.approx(wanted, rel=1e-6)
 
 
-@pytest.mark.parametrize("half", [0.8, 2.0, 6.0])
-def test_pseudo_residuals_say_as_much_as_the_density_does(half):
-    rng = np.random.default_rng(3)
-    z = rng.normal(size=400_000) + half * rng.uniform(-1, 1, 400_000)
-    flat, one = RoundedNormal(half, 1.0), np.ones(1)
-    plain, moved = (flat.normal_pseudo_residuals((z + shift)[:, None], one)[:, 0] for shift in (0.0, 0.05))
-    assert np.mean(moved - plain) == pytest.approx(0.05, rel=0.03)
-    assert np.var(plain) == pytest.approx(1 / float(flat.fisher_information), rel=0.02)
-
-    def squared_score(x: float) -> float:
-        density = (norm.cdf(x + half) - norm.cdf(x - half)) / (2 * half)
-        slope = (norm.pdf(x + half) - norm.pdf(x - half)) / (2 * half)
-        return slope**2 / density
-
-    wanted = quad(squared_score, -half - 7, half + 7, points=[-half, half], limit=200)[0]
-    assert float(flat.fisher_information) == pytest.approx(wanted, rel=1e-4)
-
-
 @pytest.mark.parametrize("declared", [False, True])
 @pytest.mark.parametrize(("noise_sd", "coarse"), [(0.4, True), (3.0, False)])
 def test_rounding_that_hides_the_noise_is_in_its_law_declared_or_not(noise_sd, coarse, declared):
@@ -91,43 +69,6 @@ def test_rounding_that_hides_the_noise_is_in_its_law_declared_or_not(noise_sd, c
     for names, model in found.models.items():
         laws = model.nodes_for_predictions(recording.readings).laws
         assert all(bool(law.flat) == (coarse and names == found.certain) for law in laws)
-
-
-@pytest.mark.parametrize("order", ["sorted", "shuffled"])
-@pytest.mark.parametrize("spread", [1.0, 10.0])
-def test_rounding_is_found_in_whatever_order_readings_are_taken(order, spread):
-    """Successive readings may differ by the signal; of readings with declared sds, the most exact show the rounding."""
-    rng, n = np.random.default_rng(1), 100
-    x = rng.uniform(-1, 1, n)
-    x = np.sort(x) if order == "sorted" else x
-    sd = np.where(rng.random(n) < 0.5, 0.05, 0.05 * spread)
-    line = Simulator(
-        "y",
-        "V",
-        {"a": (-5, 5), "b": (-5, 5)},
-        simulate=lambda p, u: p["a"] + p["b"] * u["x"],
-        time="t",
-        noise=Noise(sd="sd"),
-    )
-    readings = 0.1 * np.round((1 + 2 * x + sd * rng.standard_normal(n)) / 0.1)
-    prepared = prepare_system(line, table_for(line, {"t": np.arange(float(n)), "x": x, "sd": sd, "y": readings}))
-    effects = {"quantisation": prepared.effects["quantisation"]}
-    prior, about = PriorOdds.for_effects(effects), noise_sd_about_given_null(prepared)
-    found = NoiseModels(prepared.recording, effects, prior, about)
-    assert found.certain == ("quantisation",)
-    # Beside unequal sds the floor of the sd stands for the rounding.
-    assert found.models["quantisation",].rounding == pytest.approx(0.1 if spread == 1.0 else 0.0)
-
-
-@pytest.mark.parametrize("noise_sd", [0.5, 1.0, 3.0])
-def test_the_noise_of_rounded_readings_is_told_without_a_model(noise_sd):
-    """Rounding and all; the median of few values would be one of them. Less noise than half a step is told as less."""
-    rng = np.random.default_rng(5)
-    plan = paper_plan()
-    mean = 20 + 0.15 * np.arange(len(plan))
-    readings = Recording(plan, np.round(mean + noise_sd * rng.standard_normal(len(plan))))
-    wanted = np.sqrt(noise_sd**2 + 1 / 12 + 1 / 72)  # rounding, and what is the same spread over a step
-    assert rough_sd(readings) == pytest.approx(wanted, rel=0.2)
 
 
 @pytest.mark.parametrize("noise_sd", [0.3, 0.9, 1.6, 30.0])

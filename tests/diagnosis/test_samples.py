@@ -17,7 +17,6 @@ from probewise.diagnosis.samples import ModelSamples, sample_model, weights_besi
 from probewise.diagnosis.search import search
 from probewise.diagnosis.sensors import CalibratedSensor, default_sensor, with_free_form
 from probewise.effects import EFFECTS, Extent
-from probewise.effects.noise import drifting_noise
 from probewise.recordings import Recording, Uniform, two_way_plan
 from probewise.systems import RunTable, Simulator
 
@@ -42,23 +41,6 @@ def test_a_sensor_of_free_form_is_written_read_and_driven_by():
     mixture = sensor.mean_mixture()
     np.testing.assert_allclose(mixture.mean_mm, sensor.field.mean_mm, atol=sensor.field.pixel_mm)
     assert total_variation(mixture, sensor.field) < 0.1
-
-
-def test_a_model_does_not_hold_noise_that_changes_in_time():
-    """It is a nuisance of the search, by the recording's clock: in another plan the change would begin anew."""
-    rng = np.random.default_rng(0)
-    sensor = default_sensor(Extent(10.0, 60.0, PLAN), 1)
-    elapsed = (PLAN.time_s - PLAN.time_s.min()) / np.ptp(PLAN.time_s)
-    z = np.zeros(sensor.n_params)
-    predicted = sensor.chain(PLAN, (), n_nodes=16).predict(sensor.theta(z[None, :]), PLAN)[0]
-    recording = Recording(PLAN, predicted + 0.3 * 4.0 ** (elapsed - 0.5) * rng.standard_normal(len(PLAN)))
-    found = fit(Model(sensor, (), PLAN), recording, z, white_noise(len(PLAN), least=1e-3))
-    plain, drifting = (
-        laplace_evidence(found, NoiseModel(effects, recording, least_sd=1e-3)) for effects in ((), (drifting_noise(),))
-    )
-    assert drifting.log_z > plain.log_z + 10
-    samples = sample_model(found, drifting, recording, weights={}, rng=rng, laplace_only=True)
-    assert samples.effects == samples.chain.effects == ()
 
 
 def test_a_sensors_effects_count_from_where_those_that_were_fitted_do():
@@ -146,14 +128,3 @@ def test_the_interval_of_a_step_is_as_probable_as_least_squares_with_all_effects
     exact = _exact_weights(columns)
     assert 0.5 * np.abs(found - exact).sum() < 0.1
     assert 0.5 * np.abs(fit.weights["offset_step"] - exact).sum() > 0.3  # as it was added, alone
-
-
-def test_samples_have_the_step_where_the_readings_have_it(prepared, searched):
-    ready, columns = prepared
-    fit = _best_of(searched, ("offset_step", "sensitivity:humidity"))
-    evidence = next(iter(fit.evidence.values()))
-    drawn = sample_model(
-        fit.found, evidence, ready.recording, weights=fit.weights, rng=np.random.default_rng(0)
-    ).effect_samples("offset_step")[:, -1]
-    exact = _exact_weights(columns)
-    assert np.mean(np.abs(drawn - _AT) < 5) > exact[_AT - 5 : _AT + 4].sum() - 0.1

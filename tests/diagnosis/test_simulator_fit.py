@@ -82,16 +82,6 @@ def test_the_step_serves_all_time_constants_that_the_readings_allow(stiff):
     assert not system.integrations.too_stiff
 
 
-def test_a_law_whose_time_constant_the_readings_tell_keeps_its_step():
-    table, simulator = _table(8.0, 4), _simulator()
-    recording = recording_from_table(simulator, table)
-    system, found, sd = fit_system(System.of(simulator, table), recording)
-    assert not system.stiff
-    # The step fails at 0.01 s, which the readings exclude: there it may.
-    assert with_step_for_likely_parameters(system, table, found, sd) is system
-    assert not np.isfinite(system.chain(table, ()).predict(np.array([[0.01, 3.0]]), table)).all()
-
-
 def test_a_law_that_needs_more_steps_than_are_taken_says_so(stiff, monkeypatch):
     table, _, _, found, sd = stiff
     monkeypatch.setattr("probewise.systems.system._MOST_STEPS", 20)

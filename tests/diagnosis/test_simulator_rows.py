@@ -2,61 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
 import pytest
-from heater import ABOUT, runs
 
 from probewise.diagnosis.advice import Rival, measurement_separating_rivals
 from probewise.diagnosis.diagnose_simulator import diagnose_system, prepare_system
-from probewise.diagnosis.evidence import Linearised
 from probewise.diagnosis.fit import Model
-from probewise.diagnosis.locate import Covariate, places_of_effect, significant_places
-from probewise.diagnosis.noise import white_noise
-from probewise.diagnosis.outlying import FAR_OUT, clustering_log_bayes_factors
-from probewise.diagnosis.simulator_rows import SimulatorApparatus, candidate_runs
-from probewise.diagnosis.unknown_bases import bank_of_unknown_effects
+from probewise.diagnosis.simulator_rows import SimulatorApparatus
 from probewise.recordings import Plan
 from probewise.systems import (
     Law,
     RunTable,
     Simulator,
     System,
-    as_recording,
     concatenate_tables,
     table_for,
 )
 from probewise.systems.forms import ReferenceFit, bind_forms
 from probewise.systems.forms.formulas import formula_forms
 from probewise.systems.table import covariate_of_column
-
-TABLE = runs()
-
-
-def offered(controls=("power_w",), table=TABLE, by_law=True):
-    simulator = SimpleNamespace(reading="temp_c", controls=controls, time_unit="s", law=by_law or None)
-    commands = candidate_runs(table, simulator)
-    return {command.plan.scan_names[0]: command for command in commands}
-
-
-def test_a_function_of_the_time_is_not_asked_what_no_recorded_run_shows():
-    """A step response holds while the power is constant: a switched power would be diagnosed as a delay."""
-    assert {"1 power_w low", "1 power_w high"} <= set(offered(by_law=False))
-    assert not {"1 power_w up", "1 power_w steps"} & set(offered(by_law=False))
-    power = np.where(np.arange(len(TABLE)) == 0, 2.5, TABLE.columns["power_w"])
-    assert "1 power_w steps" in offered(table=TABLE.with_columns({"power_w": power}), by_law=False)
-
-
-def test_a_control_is_swept_held_and_switched_between_its_ends():
-    found = offered()
-    power = {name: command.plan.columns["power_w"] for name, command in found.items()}
-    np.testing.assert_allclose(power["1 power_w up"][[0, -1]], [2.0, 4.0])
-    np.testing.assert_allclose(power["1 power_w down"][[0, -1]], [4.0, 2.0])
-    assert set(power["1 power_w steps"].tolist()) == {2.0, 4.0}
-    assert set(power["1 power_w middle"].tolist()) == {3.0}
 
 
 @pytest.mark.parametrize("run", [None, "run"])
@@ -103,26 +69,6 @@ def test_every_effect_of_a_column_shows_in_it(name):
     for form in (bind_forms(about)[f"sensitivity:{name}"], *(p for p in formula_forms(about) if name in p.name)):
         assert covariate_of_column(name) in form.covariates or "time" in form.covariates
         assert set(form.covariates) <= known
-
-
-@pytest.mark.parametrize(("name", "published"), [("scan", "scan"), ("level", "column:level"), ("room_c", "room_c")])
-def test_a_place_and_a_family_of_unknown_effects_have_the_name_that_results_have(name, published):
-    """Before, a place had "column:scan" in Python and "scan" in diagnosis.json."""
-    prepared, rows = _prepared({name: _OWN[name]}), np.arange(_N)
-    covariate = Covariate(covariate_of_column(name), _OWN[name], rows)
-    bump = np.exp(-0.5 * ((_OWN[name] - 1) / 0.3) ** 2)
-    ones = np.ones((_N, 1)) / np.sqrt(_N)
-    residual = 3 * (bump - ones @ (ones.T @ bump[:, None])[:, 0]) + 0.3 * (_X - _X.mean())
-    problem = Linearised(ones, residual, white_noise(_N), 1.0, _N)
-    draws = problem.draw_null_residuals(199, rng=np.random.default_rng(0))
-    (place,) = significant_places(problem, [covariate], ("all",), residual, draws)
-    effect, plan = bind_forms(prepared.apparatus.about)[f"sensitivity:{name}"], prepared.recording.plan
-    (of_effect,) = places_of_effect(effect, bump, covariate, None, plan, residual, p_value=0.001, size=8.0)
-    assert place.covariate == of_effect.covariate == published
-    bank = bank_of_unknown_effects([covariate], _X - _X.min(), _X, np.zeros(_N, dtype=int))
-    assert set(bank.labels) <= {published, f"{published}, locally", "what was seen before", "ends of scans"}
-    assert published in bank.labels
-    assert list(clustering_log_bayes_factors(bump, [covariate])) == [f"{published}{FAR_OUT}"]
 
 
 def test_a_column_with_the_name_of_a_state_is_no_second_variable_of_that_name():
@@ -177,13 +123,3 @@ def test_a_step_that_correlated_noise_imitates_is_as_well_known_as_by_the_closed
     assert sd < 3.0
     assert at.mean == pytest.approx(mean, abs=0.5 * sd)
     assert at.sd == pytest.approx(sd, rel=0.4)
-
-
-def test_what_comes_next_is_the_last_fifth_of_the_readings_of_each_run():
-    recording = as_recording(ABOUT.system.simulator, TABLE)
-    recording = recording.with_readings(np.where(np.arange(36) < 2, np.nan, recording.readings))
-    part, names = SimulatorApparatus(ABOUT).what_comes_next(recording)
-    assert (np.flatnonzero(part == 0) + 2).tolist() == [10, 11, 22, 23, 34, 35]
-    assert (names, set(part)) == (("the last fifth",), {-1, 0})
-    timeless = replace(recording, plan=replace(TABLE, time=None))
-    assert SimulatorApparatus(ABOUT).what_comes_next(timeless) is None

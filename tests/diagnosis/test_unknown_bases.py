@@ -5,12 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from probewise.diagnosis.evidence import Linearised
 from probewise.diagnosis.light_sensor import varying_covariates
 from probewise.diagnosis.locate import Covariate
-from probewise.diagnosis.noise import white_noise
-from probewise.diagnosis.templates import TemplateBank
-from probewise.diagnosis.unknown_bases import PRODUCTS, bank_of_unknown_effects, bases_unlike_named
+from probewise.diagnosis.unknown_bases import PRODUCTS, bank_of_unknown_effects
 from probewise.recordings import two_way_plan
 
 PLAN = two_way_plan()
@@ -43,28 +40,6 @@ def test_some_basis_holds_it(mismatch):
         amount = np.linalg.lstsq(columns, mismatch)[0]
         left.append(float(np.sum((mismatch - columns @ amount) ** 2) / np.sum(mismatch**2)))
     assert min(left) < 0.1
-
-
-def test_what_a_name_describes_is_no_unknown():
-    """One offset per run is a name's; it becomes zero, and its share of the prior is not given to other bases."""
-    rng = np.random.default_rng(3)
-    run, x = np.repeat(np.arange(6), 20), np.tile(np.linspace(0, 1, 20), 6)
-    covariates = [
-        Covariate("x", x, np.arange(len(x))),
-        Covariate("run", run.astype(np.float64), np.arange(len(x)), groups=True),
-    ]
-    signal = x + 0.1 * rng.random(len(x))
-    bases = bank_of_unknown_effects(covariates, signal, np.gradient(signal), run)
-    each = (run[:, None] == np.arange(6)).astype(np.float64)
-    mean = np.ones((len(x), 1)) / np.sqrt(len(x))
-    problem = Linearised(mean, rng.standard_normal(len(x)), white_noise(len(x)), 1.0, len(x))
-    named = TemplateBank.of([each], ["offset_per_run"])
-    left = bases_unlike_named(bases, named, problem)
-    of_runs = left.indices_by_label["run"]
-    assert len(of_runs) == len(bases.indices_by_label["run"])
-    assert [bool(np.any(left[k])) for k in of_runs] == [False] + [True] * (len(of_runs) - 1)
-    factors = left.log_bayes_factors(problem)[:, 0]
-    assert factors[of_runs[0]] < -40
 
 
 def _three_columns_and_bases():

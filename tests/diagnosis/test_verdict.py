@@ -11,7 +11,6 @@ from probewise.diagnosis.search.hypotheses import HypothesisProbabilities
 from probewise.diagnosis.verdict import (
     Hypothesis,
     Judged,
-    decided_rare_effects,
     hypotheses_with_verdict,
     ranked_hypotheses,
     shared_effects,
@@ -27,41 +26,6 @@ def verdict(probabilities, *, p_value=1e-6, aliases=(), same=(), **more):
     return verdict_and_combination(
         found, p_value, noise_names=NOISE, aliases=aliases, aliased_with=lambda _: frozenset(same), **more
     )
-
-
-def test_mean_and_noise_join_into_one_name_and_the_unknown_is_one_whatever_the_noise():
-    found = ranked_hypotheses(
-        {
-            (("lag",), ()): 0.3,
-            (("lag",), ("outliers",)): 0.1,
-            (("lag",), ("drifting_noise",)): 0.2,
-            (("unknown",), ()): 0.1,
-            (("unknown",), ("outliers",)): 0.1,
-            (("arm_knock",), ()): 0.2,
-        },
-        lambda mean: ("unknown",) if mean == ("arm_knock",) else mean,
-    )
-    held = {h.effects: h.probability for h in found}
-    assert held == {("lag",): pytest.approx(0.5), ("unknown",): pytest.approx(0.4), ("lag", "outliers"): 0.1}
-    assert [h.probability for h in found] == sorted(held.values(), reverse=True)
-
-
-@pytest.mark.parametrize(
-    ("unknown", "named"),
-    [
-        ({("arm_knock",): 0.9, ("unknown",): 0.05}, ("arm_knock",)),
-        ({("arm_knock", "lag"): 0.55, ("bent_rails",): 0.05}, ("arm_knock",)),
-        ({("arm_knock",): 0.6, ("arm_knock", "lag"): 0.35}, ("arm_knock",)),
-        ({("arm_knock",): 0.6, ("unknown",): 0.3}, ()),  # bases explain it about as well
-        ({("arm_knock",): 0.6, ("bent_rails",): 0.2}, ()),
-        ({("arm_knock",): 0.4}, ()),  # names of the vocabulary have the rest
-        ({("formula:reading:y:x^2",): 0.99}, ()),  # a proposal is none
-        ({("unknown",): 0.9}, ()),
-    ],
-)
-def test_a_rare_effect_is_decided_where_hardly_anything_else_out_of_vocabulary_explains_as_much(unknown, named):
-    leader = max((names for names in unknown if names != ("unknown",)), key=lambda names: unknown[names], default=())
-    assert decided_rare_effects(leader, unknown) == named
 
 
 def searched(probabilities):
@@ -151,16 +115,6 @@ def test_a_credible_set_is_the_fewest_that_hold_the_mass():
     assert Judged("named", ("backlash",), 0.0, found).credible == ("backlash", "backlash+lag")
 
 
-def test_the_leader_is_the_effect_on_the_mean_with_the_most_probability_over_all_noises():
-    """An alias of a hundredth does not tip the class over one half, either."""
-    split = {(("lag",), ()): 0.33, (("lag",), ("outliers",)): 0.27, (("drift",), ()): 0.4}
-    assert verdict(split) == ("named", ("lag",))
-    pair = Alias(("drift", "lag"), 0.95, "repeat", 26)
-    split = {(("lag",), ()): 0.49, (("lag",), ("outliers",)): 0.42, (("drift",), ()): 0.02, ((), ()): 0.07}
-    assert verdict(split, aliases=(pair,), same=[("drift",)]) == ("named", ("lag",))
-    assert verdict({((), ("outliers",)): 0.6, (("lag",), ()): 0.4}) == ("noise", ("outliers",))
-
-
 def by_what_is_shared(verdict, combination, probabilities, *, p_value=1e-6, aliases=()):
     hypotheses = tuple(Hypothesis(names, p) for names, p in probabilities.items())
     judged = with_shared_effects(Judged(verdict, combination, p_value, hypotheses, aliases=aliases), NOISE)
@@ -176,25 +130,12 @@ def test_an_effect_that_nearly_all_hypotheses_share_is_named_whatever_is_open_be
     assert doubtful[0] == "cannot_tell"
 
 
-def test_a_likely_partner_of_a_shared_effect_is_in_the_combination_but_not_stated():
-    probabilities = {("delay", "drag"): 0.67, ("cubic", "delay"): 0.25, ("delay",): 0.08}
-    hypotheses = tuple(Hypothesis(names, p) for names, p in probabilities.items())
-    judged = with_shared_effects(Judged("cannot_tell", ("delay", "drag"), 1e-6, hypotheses), NOISE)
-    assert (judged.verdict, judged.combination, judged.stated) == ("named", ("delay", "drag"), ("delay",))
-
-
 def test_an_effect_with_a_credible_alias_is_not_shared():
     """Half of the probability is not enough: of 0.52 and 0.48, the prior alone decides."""
     assert by_what_is_shared("cannot_tell", ("lag",), {("lag",): 0.52, ("drift",): 0.48})[0] == "cannot_tell"
     joint = {("drift", "lag"): 0.8, ("lag",): 0.1, ("drift",): 0.1}  # each is in nine tenths, both in eight
     assert by_what_is_shared("cannot_tell", ("drift", "lag"), joint)[1] == ("drift", "lag")
     assert len(shared_effects(joint)) == 1
-
-
-def test_a_shared_fault_of_the_noise_names_no_physics():
-    probabilities = {("lag", "outliers"): 0.4, ("drift", "outliers"): 0.4, ("outliers",): 0.2}
-    judged = by_what_is_shared("cannot_tell", ("lag", "outliers"), probabilities)
-    assert judged[:2] == ("cannot_tell", ("lag", "outliers"))
 
 
 def test_noise_is_no_verdict_if_most_of_the_probability_is_on_the_mean():
@@ -205,11 +146,3 @@ def test_noise_is_no_verdict_if_most_of_the_probability_is_on_the_mean():
     assert judged[:2] == ("cannot_tell", ("step",))
     assert by_what_is_shared("noise", ("outliers",), probabilities, aliases=(pair,), p_value=0.3)[1] == ()
     assert by_what_is_shared("noise", ("outliers",), {("outliers",): 0.5, ("drift",): 0.5})[0] == "noise"
-
-
-def test_the_unknown_is_shared_out_over_what_it_may_be():
-    hypotheses = (Hypothesis(("unknown",), 0.8), Hypothesis((), 0.2))
-    judged = Judged("unknown", ("unknown",), 1e-6, hypotheses, unknown_shares={"time": 0.25, "level": 0.75})
-    assert judged.unknown_candidates == (("level", pytest.approx(0.6)), ("time", pytest.approx(0.2)))
-    assert (judged.unknown_probability, judged.clean_probability) == (0.8, 0.2)
-    assert judged.credible == ("unknown", "clean")

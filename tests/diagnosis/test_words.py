@@ -4,30 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from probewise.diagnosis.words import effects_in_words, hypothesis_in_words, join_lists, parameter_in_words
-
-
-@pytest.mark.parametrize(
-    ("names", "said"),
-    [
-        (("interference", "interference~again"), "two waves in the readings"),
-        (
-            ("lag", "periodic_error:u", "periodic_error:u~again"),
-            "a sensor that follows slowly and two periodic errors of u",
-        ),
-        (
-            ("depends:tau_s:at 10:30", "sensitivity:a:b"),
-            "tau_s that depends on at 10:30 and readings that depend on a:b",
-        ),
-        (("flicker", "lag"), "a flickering lamp and a sensor that follows slowly"),
-    ],
-)
-def test_two_of_one_kind_are_one_item(names, said):
-    assert hypothesis_in_words(names) == said
-
-
-def test_what_is_no_plain_noun_is_there_twice():
-    assert effects_in_words(["outliers", "outliers~again"]) == ["outlying readings (twice)"]
+from probewise.diagnosis.words import join_lists, parameter_in_words
 
 
 def test_lists_in_a_list_are_parted_by_semicolons():

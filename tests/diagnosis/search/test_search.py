@@ -88,23 +88,6 @@ def by_key(*candidates):
     return {(c.n_gaussians, c.names): c for c in candidates}
 
 
-@pytest.mark.parametrize(("ahead", "believed"), [(-1.0, -1.0), (2.0, 0.0), (4.0, 4.0)])
-def test_what_is_ahead_of_a_name_by_less_than_the_readings_tell_is_believed_no_more(ahead, believed):
-    stay, pruned = prune_out_of_vocabulary(
-        by_key(Held((), -50.0), Held(NAME, 0.0), Held(PUSH, ahead, left=1.0)), NOISES
-    )
-    assert stay[1, PUSH].log_z == pytest.approx(believed)
-    assert stay[1, NAME].log_z == 0.0
-    assert pruned == set()
-
-
-def test_what_predicts_the_same_as_a_name_is_left_out():
-    """Half of the squared distance is 50 * 0.3^2 / 2, less than three nats."""
-    stay, pruned = prune_out_of_vocabulary(by_key(Held((), -50.0), Held(NAME, -9.0), Held(PUSH, 0.0, left=0.3)), NOISES)
-    assert pruned == {PUSH}
-    assert (1, PUSH) not in stay
-
-
 @pytest.mark.parametrize(("behind", "goes"), [(2.0, False), (4.0, True)])
 def test_what_is_poorer_than_something_left_out_for_a_name_is_left_out_too(behind, goes):
     """A log that a curve follows is that curve; an exponential that follows neither must not lead in its place."""

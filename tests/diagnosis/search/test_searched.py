@@ -13,8 +13,6 @@ from probewise.diagnosis.search.hypotheses import Evidences, Searched, hypothesi
 
 PRIOR = PriorOdds(n_named=2, n_unnamed=0, n_noises=1)
 
-REFITS = SimpleNamespace(noises=SimpleNamespace(certain=()))
-
 
 class Fit(SimpleNamespace):
     """As much of a weighed fit as its evidence."""
@@ -54,41 +52,12 @@ def test_an_evidence_that_is_no_number_leaves_all_others_as_they_are():
     assert by_mean == posterior().marginal_over_noise
 
 
-def test_the_most_probable_noise_is_that_under_any_mean_or_of_those_that_are_stated():
-    found = replace(
-        posterior(),
-        probabilities={
-            ((), ()): 0.4,
-            ((), ("outliers",)): 0.3,
-            (("lag",), ("outliers",)): 0.25,
-            ((), ("drifting_noise",)): 0.05,
-        },
-    )
-    assert found.likeliest_noise() == ("outliers",)
-    assert found.likeliest_noise(()) == ()  # a noise that has no name counts as none
-    assert found.likeliest_noise(("outliers",)) == ("outliers",)
-
-
-def test_too_few_readings_leave_no_second_copy_of_an_effect_alone():
-    prepared = SimpleNamespace(effects=dict.fromkeys(("lag", "wave", "wave~again")), noise_effect_names=frozenset())
-    searched = Searched(prepared, PRIOR, None, REFITS, EVIDENCES, posterior()).with_prior_probabilities()
-    by_mean = searched.posterior.marginal_over_noise
-    assert set(by_mean) == {(), ("unknown",), ("lag",), ("wave",)}
-    assert sum(by_mean.values()) == pytest.approx(1.0)
-
-
 FORMULA = "formula:reading:temp_c:a while |(t / period + phase) mod 1| < share / 2"
 
 
 def of(log_z):
     """Evidences of fits by their names, of which nothing has 0."""
     return Evidences({(0, names): SimpleNamespace(log_z=value) for names, value in {(): 0.0, **log_z}.items()})
-
-
-@pytest.mark.parametrize(("named", "known"), [(51.0, ("offset_drift",)), (49.0, ("unknown",))])
-def test_a_formula_beside_a_name_counts_as_the_name_if_that_explains_more(named, known):
-    evidences = of({("offset_drift",): named, (FORMULA, "offset_drift"): 100.0})
-    assert evidences.reported_as((FORMULA, "offset_drift")) == known
 
 
 def test_the_formula_beside_names_is_that_of_largest_evidence_which_adds_formulas_alone():
@@ -102,18 +71,6 @@ def test_the_formula_beside_names_is_that_of_largest_evidence_which_adds_formula
     evidences = Evidences({(0, tuple(sorted(each.names))): each for each in (alone, more, best, *others)})
     assert evidences.best_formula_beside(alone, ("outliers",)) is best
     assert evidences.best_formula_beside(others[2], ("outliers",)) is None
-
-
-@pytest.mark.parametrize(
-    ("named", "stays"), [(16.0, True), (14.0, False)], ids=["over half of all that is explained", "less than half"]
-)
-def test_a_name_stays_if_it_explains_more_than_all_that_has_no_name(named, stays):
-    """A gradient of 14 nats, a reflection that adds 10 and an unknown effect that adds 6: 14 of 30 have a name."""
-    white: tuple[str, ...] = ()
-    of_names = {(): 0.0, ("albedo_gradient",): named, ("albedo_gradient", "reflection"): 24.0}
-    fits = {(2, names): SimpleNamespace(evidence={white: SimpleNamespace(log_z=z)}) for names, z in of_names.items()}
-    evidences = Evidences(fits, unknown={(2, ("albedo_gradient", "reflection"), white): 30.0})
-    assert evidences.named_outweigh_unknown(2, ("albedo_gradient", "reflection"), white) is stays
 
 
 def test_a_name_stands_beside_what_is_unknown_in_its_share_of_the_evidence():

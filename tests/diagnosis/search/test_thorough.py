@@ -151,11 +151,6 @@ def test_nested_sampling_wins_where_it_disagrees(stepped, monkeypatch):
     assert sum(found.posterior.probabilities.values()) == pytest.approx(1.0)
 
 
-def test_within_a_nat_laplace_stands(stepped, monkeypatch):
-    found, _ = moved(stepped, monkeypatch, -0.9)
-    assert found is stepped
-
-
 def test_a_run_with_doubts_does_not_win(stepped, monkeypatch):
     found, weighings = moved(stepped, monkeypatch, 5.0, doubts=("few effective samples",))
     assert found is stepped

@@ -209,41 +209,6 @@ def test_a_place_that_cannot_be_written_to_is_found_out_first(where, tmp_path):
     assert problem.n_calls == 0
 
 
-@dataclasses.dataclass(frozen=True)
-class OtherMove:
-    """A move of somebody else's."""
-
-    move: SliceMove = dataclasses.field(default_factory=SliceMove)
-    length: float = 1.0
-
-    def draw(self, *of_a_round):
-        return self.move.draw(*of_a_round)
-
-    def adapted(self, tally):
-        return dataclasses.replace(self, length=self.length / 3)
-
-
-def test_a_move_and_a_rule_of_ones_own_are_taken_up_again(path):
-    """What the move has tuned comes back; where a rule's function stands in memory is no other rule."""
-
-    @dataclasses.dataclass(frozen=True)
-    class Rule:
-        wrapped: Callable
-
-        def __call__(self, state):
-            return self.wrapped(state)
-
-    def own(**options):
-        rule = Rule(lambda state: "enough" if state.n_dead > 100 else None)
-        return sloping(slope(), move=OtherMove(), stop=rule, **options)
-
-    whole = own()
-    with pytest.raises(Stop):
-        own(progress=stopper(6), checkpoint=path)
-    assert_same(own(checkpoint=path), whole)
-    assert whole.stop_reason == "enough"
-
-
 def test_a_disk_that_fills_up_costs_the_checkpoint_only(path, monkeypatch):
     whole, good = sloping(slope()), itertools.count()
 

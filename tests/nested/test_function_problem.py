@@ -13,7 +13,6 @@ from scipy.special import i0e
 from probewise.errors import NotConvergedError, ParameterError
 from probewise.nested import (
     Evaluator,
-    RemainingEvidence,
     SliceMove,
     diversify,
     make_problem,
@@ -156,23 +155,6 @@ def test_a_likelihood_that_writes_into_its_argument_changes_nothing():
     clean, messy = (few(function, SQUARE, vectorized=True, max_cost=5.0) for function in (many_points, writes))
     assert np.array_equal(clean.theta, messy.theta)
     assert clean.log_z == messy.log_z
-
-
-@pytest.mark.parametrize("constant", [-1e100, 1e100, -1e14, 7.0])
-def test_a_constant_likelihood_is_its_own_evidence(constant):
-    result = quiet(lambda x: np.full(len(x), constant), SQUARE, vectorized=True, n_live=30)
-    assert result.log_z == pytest.approx(constant, rel=1e-12)
-    assert result.weight.sum() == pytest.approx(1.0)
-    assert result.information == pytest.approx(0.0, abs=1e-9)
-    assert not result.warnings
-
-
-def test_minus_1e100_may_stand_for_impossible_in_part_of_the_prior():
-    def half(x):
-        return np.where(x[:, 0] > 0, many_points(x), -1e100)
-
-    result = quiet(half, SQUARE, vectorized=True, n_live=100, stop=RemainingEvidence(0.01))
-    assert abs(result.log_z - LOG_Z + math.log(2)) < N_ERRORS * result.log_z_error
 
 
 class OneWay:

@@ -4,7 +4,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import pytest
 from nested_sampling.problems import Known, box
 from runs import quiet
 from scipy.stats import chi2
@@ -45,8 +44,3 @@ def test_chains_that_remember_have_an_error_that_knows_it():
     z = np.array([(r.log_z - LOG_Z) / r.log_z_error for r in found])
     low, high = np.sqrt(chi2.ppf([0.0005, 0.9995], n - 1) / (n - 1))
     assert low < np.std(z, ddof=1) < high < np.std(z * np.sqrt([r.memory for r in found]), ddof=1)
-
-
-@pytest.mark.parametrize("options", [{}, {"n_replaced": 7}])
-def test_independent_points_have_no_memory(options):
-    assert np.mean([r.memory for r in runs(0.0, 8, **options)]) < 1.1

@@ -9,16 +9,13 @@ import pytest
 from scipy.stats import chi2, norm
 
 from probewise._arrays import FloatArray
-from probewise.nested import FunctionProblem, Weighted, pareto_k, run, update
+from probewise.nested import Weighted, run, update
 from probewise.nested.clusters import find_disconnected_clusters
 from probewise.nested.importance import (
     _bridge_sampling_estimate,
-    draw_and_weigh,
-    fit_wide_and_narrow_proposals,
-    mixture_of_proposals,
     with_error_of_lost_parts,
 )
-from probewise.nested.problem import Evaluator, unbounded_space_of
+from probewise.nested.problem import unbounded_space_of
 from probewise.priors import Normal, Product
 
 FALSE_ALARM = 1e-4
@@ -67,34 +64,6 @@ def test_a_part_followed_by_few_lines_of_descent_may_be_lost():
     hopeless = with_error_of_lost_parts(found, 0.5, space, rng)
     assert not hopeless.sound
     assert "may be lost" in hopeless.summary()
-
-
-def test_weighted_draws_give_the_evidence():
-    """The truth by the closed form of a Gaussian likelihood and prior."""
-    rng = np.random.default_rng(6)
-    likelihood = FunctionProblem(
-        lambda theta: norm.logpdf(theta[:, 0], 1.0, 0.5), Product({"x": Normal(0, 1)}), vectorized=True
-    )
-    space = unbounded_space_of(likelihood.prior)
-    proposal = fit_wide_and_narrow_proposals(space.enter(0.8 + 0.45 * rng.standard_normal((200, 1))), rng=rng)[-1]
-    evaluate = Evaluator(likelihood)
-    found = draw_and_weigh(proposal, None, space, evaluate, n_draws=2000, rng=rng)
-    assert evaluate.n_calls == 2000
-    assert found.log_z == pytest.approx(norm.logpdf(1.0, 0.0, math.hypot(1.0, 0.5)), abs=4.5 * found.log_z_error)
-    assert found.log_z_error < 0.05
-
-
-def test_joined_proposals_get_their_shares_of_the_draws_and_of_the_density():
-    rng = np.random.default_rng(3)
-    left = fit_wide_and_narrow_proposals(rng.standard_normal((30, 1)) - 10.0, rng=rng)
-    right = fit_wide_and_narrow_proposals(rng.standard_normal((30, 1)) + 10.0, rng=rng)
-    both = mixture_of_proposals([*left, *right], [0.7, 0.3])
-    drawn = both.draw(4000, rng=rng)
-    assert (drawn < 0).mean() == pytest.approx(0.7, abs=4 * math.sqrt(0.21 / 4000))
-    grid = np.linspace(-40, 40, 20_001)[:, None]
-    density = np.exp(both.log_density(grid))
-    assert density.sum() * 80 / 20_000 == pytest.approx(1.0, abs=1e-3)
-    assert density[grid[:, 0] < 0].sum() / density.sum() == pytest.approx(0.7, abs=1e-3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,12 +133,3 @@ def test_a_reading_that_surprises_is_inferred_from_scratch():
     assert found.sound
     assert abs(found.log_z - odd.log_z) < 4 * found.log_z_error
     assert found.n_calls > found.run.n_calls
-
-
-def test_the_shape_of_a_tail_is_found():
-    """Weights with a Pareto tail of shape k have P(weight > w) = w**(-1/k)."""
-    u = np.random.default_rng(4).random(100_000)
-    for k in (0.3, 0.6, 1.0):
-        assert pareto_k(-k * np.log(u)) == pytest.approx(k, abs=0.15)
-    # Of equal weights one of the candidate shapes is the exponential's, where the formula is nought over nought.
-    assert np.isfinite(pareto_k(np.concatenate([np.zeros(1890), np.full(110, np.log(2.0))])))

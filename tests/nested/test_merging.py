@@ -1,7 +1,6 @@
 """Merged runs: counts by births and deaths against counts kept by the sampler, evidences against known ones."""
 
 import dataclasses
-import math
 
 import numpy as np
 import pytest
@@ -10,9 +9,6 @@ from nested_sampling import problems
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.nested import merge, run
 from probewise.nested.result import n_alive_at_death
-from probewise.priors import Product, Uniform
-
-N_ERRORS = 3.9
 
 
 def several(problem, n_runs, *, n_live=50, seed=5, max_cost=5.0):
@@ -52,47 +48,6 @@ def test_merged_runs_are_one_run_with_the_live_points_of_all(terraces, rng):
     assert np.array_equal(alive(merged), merged.n_at_death)
     assert not merged.warnings
     assert merged.memory == pytest.approx(np.mean([r.memory for r in terraces]))
-
-
-def test_runs_of_different_live_points_and_ends_are_merged(rng):
-    problem = problems.gaussian(2, 0.5)
-    one, two = (run(problem, rng=np.random.default_rng(n), n_live=n) for n in (40, 120))
-    with pytest.warns(DoubtfulResultWarning, match="max_calls"):
-        short = run(problem, rng=np.random.default_rng(3), n_live=80, max_calls=600)
-    merged = merge([one, two], rng=rng)
-    assert abs(merged.log_z - problem.log_z) < N_ERRORS * merged.log_z_error
-    assert merged.log_z_error < one.log_z_error
-    early = np.minimum.reduce([r.log_likelihood[-r.n_live] for r in (one, two, short)])
-    all_three = [one, two, dataclasses.replace(short, log_z=two.log_z)]  # what it lacks is not the matter here
-    joined = merge(all_three, rng=rng)
-    # Half of 240 remain at the end of rounds that coincide.
-    assert (joined.n_at_death[joined.log_likelihood < early] > 120).all()
-    assert joined.warnings == (f"run 3 of 3: {short.warnings[0]}", *(f"run 3 of 3: {w}" for w in short.warnings[1:]))
-    assert abs(joined.log_z - problem.log_z) < N_ERRORS * joined.log_z_error
-
-
-def test_merging_in_two_stages_is_merging_at_once(terraces):
-    halves = [merge(part, rng=np.random.default_rng(0)) for part in (terraces[:3], terraces[3:])]
-    staged, at_once = (merge(parts, rng=np.random.default_rng(0)) for parts in (halves, terraces))
-    assert staged.log_z == at_once.log_z
-    assert np.array_equal(staged.theta, at_once.theta)
-    assert staged.seed_state == at_once.seed_state
-    with pytest.raises(ParameterError, match="seed_state of run 2"):
-        merge([halves[0], terraces[1]], rng=np.random.default_rng(0))
-
-
-def test_the_possible_share_of_the_prior_is_pooled(rng):
-    """A ball in a box: a pooled share of found over drawn, and the evidence is the share."""
-    prior = Product({"x": Uniform(-1, 1), "y": Uniform(-1, 1)})
-    disc = problems.Known(prior, lambda t: np.where((t**2).sum(axis=1) < 0.5, 0.0, -np.inf), math.log(math.pi / 8))
-    runs = [run(disc, rng=np.random.default_rng(n), n_live=n) for n in (100, 300)]
-    merged = merge(runs, rng=rng)
-    drawn = [r.n_live / math.exp(r.log_start) for r in runs]
-    share = 400 / sum(drawn)
-    assert math.exp(merged.log_start) == pytest.approx(share)
-    assert merged.log_start_error == pytest.approx(math.sqrt((1 - share) / 400))
-    assert abs(merged.log_z - disc.log_z) < N_ERRORS * merged.log_z_error
-    assert "of the prior" in merged.summary()
 
 
 def test_runs_that_disagree_say_so_and_widen_the_error(terraces, rng):

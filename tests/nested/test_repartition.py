@@ -5,11 +5,9 @@ import math
 import numpy as np
 import pytest
 from nested_sampling.problems import Known
-from scipy.special import ndtr
 
-from probewise import nested
 from probewise.nested.importance import repartitioned
-from probewise.priors import Normal, Product, Uniform
+from probewise.priors import Normal, Product
 
 WIDE = Product({"x": Normal(0.0, 10.0), "y": Normal(0.0, 10.0)})
 
@@ -18,20 +16,6 @@ def _two(theta):
     """Two spots, three to one."""
     x, y = theta.T
     return np.logaddexp(math.log(0.75) - 50 * ((x - 2) ** 2 + y**2), math.log(0.25) - 50 * ((x + 2) ** 2 + y**2))
-
-
-def test_walls_of_the_prior_stay_where_they_are():
-    """A slope down from the wall of a cube: 1 - exp(-20)."""
-    problem = Known(Product({"x": Uniform(0.0, 1.0)}), lambda theta: math.log(20) - 20 * theta[:, 0], 0.0)
-    rng = np.random.default_rng(7)
-    first = nested.run(problem, rng=rng, n_live=100, max_cost=1.0)
-    near = repartitioned(problem, first.samples(2000, rng=rng))
-    second = nested.run(near, rng=rng, n_live=400, max_cost=1.0)
-    assert abs(second.log_z) < 4 * second.log_z_error < 0.4
-    # Its prior is a density over the parameter, integrated over its normal score, where the walls are far.
-    score = np.linspace(-7.5, 7.5, 20_001)
-    density = np.exp(-near.prior.log_prior_ratio(ndtr(score)[:, None]) - 0.5 * score**2) / math.sqrt(2 * math.pi)
-    assert np.trapezoid(density, score) == pytest.approx(1.0, abs=3e-3)
 
 
 def test_a_peak_has_a_part_of_the_prior():

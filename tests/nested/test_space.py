@@ -73,31 +73,6 @@ def test_parameters_are_found_again_from_coordinates_without_walls(prior):
     assert np.isinf(space.bounds).all()
 
 
-def test_coordinates_that_lead_nowhere_have_no_density_and_raise_nothing():
-    prior = paper_prior(2)
-    inside = prior.coordinates.enter(prior.from_unit_cube(0.3 + 0.4 * cube(prior, 1)))[0]
-    n_params = len(prior.names)
-    far = np.concatenate([np.full((1, n_params), v) for v in (1e4, -1e4, 800.0, -800.0)])
-    mixed = np.random.default_rng(5).choice([-1e4, -300.0, 300.0, 1e4], size=(500, n_params))
-    changes = {
-        "amplitude above its bound": (0, 60.0),
-        "centre off its bound": (1, 500.0),
-        "variance beyond any": (3, 300.0),
-        "variance below any": (4, -300.0),
-        "correlation of one": (5, 40.0),
-        "the second heavier than the first": (6, 0.5),
-        "level off its bound": (n_params - 1, 90.0),
-    }
-    moved = np.repeat(inside[None, :], len(changes), axis=0)
-    for row, (column, value) in enumerate(changes.values()):
-        moved[row, column] = value
-    assert np.isfinite(prior.coordinates.leave(inside[None, :])[1]).all()
-    for x in (far, mixed, moved):
-        theta, log_density = prior.coordinates.leave(x)
-        assert (log_density == -np.inf).all()
-        assert not np.isnan(theta).any()
-
-
 def test_normal_scores_have_the_density_of_a_standard_normal_prior():
     space = unbounded_space_of(Circle().prior)
     x = space.draw(1000, rng=np.random.default_rng(3))

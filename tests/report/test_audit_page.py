@@ -1,11 +1,7 @@
 """The page of an audit: its matrix says how it is read, its sizes are in words with units."""
 
 import numpy as np
-import pytest
 
-from probewise.diagnosis import EffectAudit
-from probewise.diagnosis.audit import DetectableSize
-from probewise.report.audit import audit_table
 from probewise.report.plots import audit_matrix
 
 NAMES = ["lag", "backlash", "outliers"]
@@ -23,16 +19,3 @@ def test_the_matrix_marks_the_row_that_is_taken_for_the_column_and_leaves_out_wh
     (circle,) = zip(*matrix.lines[0].get_data(), strict=True)
     assert circle == (1, 2)
     assert "row: the effect present" in matrix.get_title(loc="left")
-
-
-@pytest.mark.parametrize(
-    ("size", "said"),
-    [
-        (DetectableSize("per_volt", "1/V", 0.069), "per volt 0.069 per V"),
-        (DetectableSize("amp", "LEGO", 0.55), "amplitude 0.55 LEGO units"),
-        (DetectableSize("ceiling_v", "V", None), "ceiling v at no size"),
-    ],
-    ids=lambda value: value.parameter if isinstance(value, DetectableSize) else "",
-)
-def test_a_size_is_in_words_with_its_unit(size, said):
-    assert f">{said}<" in audit_table([EffectAudit("lag", "fine", 0.9, smallest=(size,))])

@@ -20,11 +20,6 @@ def words_and_unit(name):
     return covariate_in_words_and_unit(SimpleNamespace(recording=recording, apparatus=LightSensorApparatus()), name)
 
 
-@pytest.mark.parametrize("name", ["k", "c", "v", "s", "mm", "deg", "percent", "_k"])
-def test_a_letter_that_is_the_whole_name_of_a_column_is_no_unit(name):
-    assert words_and_unit(name) == (name.replace("_", " "), "")
-
-
 @pytest.mark.parametrize(
     ("name", "said"),
     [

@@ -11,11 +11,9 @@ from mixtures import fixed_mixture
 from probewise.diagnosis import EffectFound, ParameterFound, Place, diagnose
 from probewise.diagnosis.advice import NextMeasurement
 from probewise.diagnosis.light_sensor import LightSensorApparatus
-from probewise.recordings import Recording, paper_plan, read_plan, shipped
+from probewise.recordings import Recording, paper_plan
 from probewise.report import covariates
 from probewise.report import diagnosis as page
-from probewise.report.covariates import is_scan_along_line
-from probewise.report.diagnosis_figures import rows_of_scan_changed_most
 from probewise.report.residual_means import mean_residuals
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FixedLevels
@@ -100,23 +98,6 @@ def test_the_band_of_chance_holds_ninety_five_of_a_hundred_means_after_a_fit():
     # 400 draws of a share of 0.95 lie below 0.90 or above 0.985 less than once in 1,000.
     assert by_step.min() > 0.90
     assert by_step.max() < 0.985
-
-
-def test_before_and_after_shows_a_scan_along_a_line_though_four_patterns_under_one_place_change_more():
-    plan = read_plan(shipped("concealed"))
-    assert {name for rows, name in scans_of(plan) if not is_scan_along_line(plan, rows)} == {"quadrants"}
-    change = np.zeros(len(plan))
-    for rows, name in scans_of(plan):
-        change[rows] = {"quadrants": 9.0, "edge_90_out": 0.5}.get(name, 0.1)
-    chosen = rows_of_scan_changed_most(plan, change)
-    assert plan.scan_names[plan.scan[chosen[0]]] == "edge_90_out"
-    alone = plan.take(next(rows for rows, name in scans_of(plan) if name == "quadrants"))
-    assert len(rows_of_scan_changed_most(alone, np.ones(4))) == 4
-    assert not is_scan_along_line(plan, np.arange(1))
-
-
-def scans_of(plan):
-    return [(rows, plan.scan_names[plan.scan[rows[0]]]) for rows in plan.rows_by_scan()]
 
 
 def test_places_come_as_the_headline_names_them_then_as_they_are_seen(monkeypatch):

@@ -19,11 +19,10 @@ from probewise.priors import Product, Uniform
 from probewise.proof import pages as of_campaigns
 from probewise.proof.campaign import Estimate, estimated_share
 from probewise.proof.concealed_study import ConcealedRow
-from probewise.recordings import Recording, paper_plan, read_recording, shipped
+from probewise.recordings import Recording, read_recording, shipped
 from probewise.report import plots
 from probewise.report.exploration import animated_gif
 from probewise.report.plots import canvas
-from probewise.report.plots.readings import tracks_and_single_rows
 from probewise.report.residual_means import mean_residuals
 from probewise.sensor import SSFField
 
@@ -223,27 +222,9 @@ def test_drawing_on_given_axes_opens_no_figure():
     assert plt.get_fignums() == [sheet.number]
 
 
-def test_the_legend_of_a_field_has_room_below_axes_of_a_persons_own():
-    sheet, ax = plt.subplots(layout="constrained")
-    plots.playing_field(**field(), ax=ax)
-    plots.draw_field_legend(ax)
-    sheet.canvas.draw()
-    assert sheet.legends[0].get_window_extent().y1 <= ax.xaxis.label.get_window_extent().y0
-    plt.close(sheet)
-
-
 def test_readings_without_a_unit_have_no_empty_brackets():
     ax = plots.mean_residuals_along(means(), label="time (s)", unit="")
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("time (s)", "mean residual")
-
-
-def test_the_papers_plan_has_four_lines_and_four_readings_alone():
-    found, alone = tracks_and_single_rows(paper_plan())
-    assert [len(t.rows) for t in found] == [101] * 4
-    assert [t.label for t in found] == ["0°", "90°", "180°", "270°"]
-    assert len(alone) == 4
-    for track in found:
-        np.testing.assert_allclose(np.sort(track.along_mm), np.arange(-50.0, 51.0), atol=1e-9)
 
 
 def test_predictions_get_a_panel_a_scan_and_one_for_the_readings_alone(recording):
@@ -290,11 +271,6 @@ def test_the_colours_span_the_angles_that_there_are_also_across_180_degrees(moun
     assert all(-180 <= float(tick.replace("−", "-")) <= 180 for tick in ticks)
 
 
-def test_an_arm_that_reaches_nothing_can_be_drawn():
-    ax = plots.reach_map(np.full((33, 66), np.nan), X_MM, Y_MM, axis_mm=(524.0, 580.0))
-    assert ax.get_title(loc="left").startswith("0 %")
-
-
 def test_frames_follow_each_other():
     red, blue = io.BytesIO(), io.BytesIO()
     Image.new("RGB", (8, 6), "red").save(red, "PNG")
@@ -327,17 +303,6 @@ def test_rounded_readings_lie_on_their_lattice():
     counts = [bar.get_height() for bar in ax.containers[0]]
     assert max(counts) == 200
     assert np.argmax(counts) == 20
-
-
-def test_neighbours_of_ar_1_noise_are_correlated_by_rho():
-    rng, rho = np.random.default_rng(1), 0.6
-    noise = rng.standard_normal(4000)
-    for k in range(1, 4000):
-        noise[k] += rho * noise[k - 1]
-    ax = plots.residual_autocorrelation(noise, np.zeros(4000, dtype=int))
-    (found,) = (line for line in ax.lines if line.get_label() == "residuals")
-    # The standard error is about 1 / sqrt(4000).
-    np.testing.assert_allclose(found.get_ydata()[:2], [rho, rho**2], atol=0.08)
 
 
 @pytest.mark.slow

@@ -4,8 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from matplotlib.collections import PathCollection, PolyCollection
-from scipy.integrate import trapezoid
+from matplotlib.collections import PolyCollection
 from scipy.stats import binom
 
 from probewise.errors import ParameterError
@@ -39,22 +38,6 @@ def bell_samples(n_params, n=600):
     theta = np.random.default_rng(1).normal(size=(n, n_params))
     names = tuple(f"p{i}" for i in range(n_params))
     return Samples(names, theta, -0.5 * (theta**2).sum(axis=1), np.full(n, -np.log(n)), -3.0, 0.1, float(n), n)
-
-
-def test_a_trace_shows_every_dead_point_against_the_volume_left(result):
-    axes = plots.trace_plot(result)
-    assert axes.shape == (4, 1)
-    assert "ln X" in axes[-1, 0].get_xlabel()
-    assert "−" in axes[0, 0].get_title(loc="left")
-    (dots,) = (c for c in axes[1, 0].collections if isinstance(c, PathCollection))
-    shown = np.asarray(dots.get_offsets())
-    assert len(shown) == result.n_dead
-    order = np.argsort(shown[:, 0])
-    assert shown[order, 0] == pytest.approx(-result.log_volume)
-    assert shown[order, 1] == pytest.approx(result.theta[:, 0])
-    line = axes[0, 0].lines[0]
-    assert trapezoid(line.get_ydata(), line.get_xdata()) == pytest.approx(1.0, abs=0.05)
-    assert plots.png(axes, dpi=30).startswith(b"\x89PNG")
 
 
 @pytest.mark.slow

@@ -12,9 +12,8 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from probewise._signals import Stopped
 from probewise._writing import Drawings, Output
 from probewise.cli import main
-from probewise.errors import FileError, NotDrawnError
+from probewise.errors import NotDrawnError
 from probewise.proof import concealed_study
-from probewise.report.html import figure
 from probewise.report.plots.canvas import axes_of_frame
 from probewise.systems import run_table_csv
 
@@ -148,17 +147,6 @@ def test_one_figure_that_fails_leaves_the_others(tmp_path):
         drawings.raise_if_any_failed()
 
 
-def test_a_picture_of_a_step_for_which_there_is_no_room_ends_no_search(sensor_file, tmp_path, monkeypatch, capsys):
-    def full(search, name, content):
-        raise FileError(name, "cannot be written (No space left on device)", "a disk with room")
-
-    monkeypatch.setattr("probewise.cli.explore.Search.write", full)
-    words = ("explore", "--sensor", sensor_file, "--max-readings", 1, "--trust", 1, "--quiet", "--out", tmp_path)
-    assert main([str(word) for word in words]) == 1
-    assert "could not draw frames/001.png (FileError: " in capsys.readouterr().err
-    assert {"result.json", "report.html", "journal.jsonl"} <= {path.name for path in tmp_path.iterdir()}
-
-
 def test_a_page_that_cannot_be_written_is_one_that_is_not_drawn(tmp_path):
     (tmp_path / "report.html").mkdir()
     with pytest.raises(NotDrawnError, match=r"a directory of that name .*; the results are in .*, without figures"):
@@ -172,7 +160,3 @@ def test_an_interruption_while_figures_are_drawn_says_where_the_results_are(tmp_
     with pytest.raises(Stopped, match=r"the results are in .*, without figures and report"):
         Drawings(tmp_path).write_results(Output(lambda stage: None, {"first.svg": interrupt}, lambda drawn: ""))
     assert not [path for path in tmp_path.iterdir() if path.name[0] != "."]
-
-
-def test_a_page_says_where_a_figure_is_missing():
-    assert "could not be drawn" in figure(b"", "Residuals.")

@@ -12,7 +12,6 @@ import pytest
 from probewise.cli import main
 from probewise.cli._executor import worker_pool
 from probewise.errors import NotConvergedError
-from probewise.report import each
 
 LINE = (
     "reading, unit = 'y', 'V'\nparameters = {'slope': (-5, 5), 'offset': (-5, 5)}\nvectorized = True\n"
@@ -50,17 +49,6 @@ def test_each_recording_has_a_row_and_a_folder_and_is_diagnosed_once(tmp_path, m
         (out / "a" / "diagnosis.json").write_text(damaged)
         assert main(again) == 0
         assert "a,refused,,,,,again" in (out / "table.csv").read_text().splitlines()
-
-
-def test_rows_are_sorted_by_what_ails_most_devices():
-    rows = [
-        each.DeviceRow("clean one", "clean"),
-        each.DeviceRow("lagging", "named", "lag", 9.0, 0.9, 0.001, "it lags"),
-        each.DeviceRow("worse", "named", "drag:v", 20.0),
-        each.DeviceRow("bad", "named", "drag:v", 12.0),
-    ]
-    assert [row.device for row in each.in_order(rows)] == ["worse", "bad", "lagging", "clean one"]
-    assert each.columns_of(rows)["probability"] == ["", "", "0.9", ""]
 
 
 def test_names_that_cannot_name_a_folder_and_one_with_other_results_are_refused(tmp_path, capsys):

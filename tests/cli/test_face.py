@@ -205,11 +205,3 @@ def test_the_verbs_take_a_table_and_a_simulator_too(tmp_path, sensor):
         probewise.diagnose(table, simulator=file, sensor=sensor, rng=rng)
     with pytest.raises(ParameterError, match="rng"):
         probewise.predict(fitted, table)
-
-
-def test_the_recordings_that_ship_are_called_by_their_names():
-    from probewise.cli._options import SHIPPED_RECORDINGS
-    from probewise.recordings.io import SHIPPED, shipped
-
-    assert SHIPPED_RECORDINGS.keys() == set(SHIPPED)
-    assert all(path.samefile(shipped(name)) for name, path in SHIPPED_RECORDINGS.items())

@@ -11,8 +11,8 @@ from probewise.arm import DryRun, LegoArm, read_geometry, shipped_geometry_path
 from probewise.arm.geometry import Accuracy
 from probewise.cli import main
 from probewise.cli._bench import warn_if_place_sd_large
-from probewise.cli.arm import SheetCheck, bring_to_mark, place_after_moves, uniform_shades_at_places
-from probewise.recordings import HalfPlane, Uniform, paper_plan, write_plan
+from probewise.cli.arm import SheetCheck, bring_to_mark, place_after_moves
+from probewise.recordings import paper_plan, write_plan
 
 OFF = {"x_mm": 3, "y_mm": -3, "shoulder_forward_mm": 3, "shoulder_height_mm": -3, "upper_mm": 3, "lower_mm": -3}
 
@@ -109,12 +109,6 @@ def test_an_answer_is_a_move_or_nothing(answer, moved):
     assert place_after_moves((1, 2, 60), answer) == moved
 
 
-def test_shades_are_those_that_fill_the_sensors_view():
-    places = np.array([[-20.0, 0.0], [-10.0, 0.0], [20.0, 0.0]])
-    np.testing.assert_array_equal(uniform_shades_at_places(HalfPlane(0.0, 0.0), places), [0, np.nan, 1])
-    np.testing.assert_array_equal(uniform_shades_at_places(Uniform(0.5), places), [np.nan] * 3)
-
-
 def edge(n=101):
     return paper_plan().take(np.arange(n))
 
@@ -125,11 +119,3 @@ def test_a_scan_that_starts_over_the_wrong_side_is_told_of_at_the_first_reading_
     first = next(k for k, text in enumerate(said) if text)
     assert first == 65  # the first that is all white, and dark
     assert "at (15, 0) mm it is white, and reads 14, where black read 58" in said[first]
-
-
-def test_a_right_scan_is_not_told_of():
-    plan = edge()
-    noise = np.random.default_rng(3).normal(0.0, 1.5, len(plan))
-    watch = SheetCheck(plan, white_is_bright=True)
-    levels = 14 + 44 / (1 + np.exp(-plan.x_mm / 3))
-    assert not any(watch.complaint_about_reading(row, float(value)) for row, value in enumerate(levels + noise))

@@ -140,22 +140,6 @@ def test_an_input_that_would_be_replaced_is_set_aside_with_its_description(tmp_p
     }
 
 
-def test_results_that_replace_those_of_an_earlier_run_say_so(tmp_path):
-    said, stages = [], []
-    for other in ("b.json", "c.json"):
-
-        def write(stage, other=other):
-            stage.write("a.json", "{}")
-            stage.write(other, "{}")
-
-        tell = lambda *told: stages.append(told)  # noqa: E731
-        drawings = Drawings(tmp_path)
-        drawings.write_results(Output(write, {}, lambda drawn: "", main="a.json"), progress=tell)
-        said.append(drawings.notes)
-    assert said == [[], ["note: the results of an earlier run there were replaced"]]
-    assert stages[0] == ("writing the results",)
-
-
 def test_a_search_does_not_replace_the_sensor_that_it_was_given(sensor_file, tmp_path, quick_frames, capsys):
     sensor_file.write_text(sensor_file.read_text() + "\n")  # which the search would not write
     before = sensor_file.read_bytes()

@@ -139,16 +139,6 @@ def test_a_plan_is_recorded_in_the_instruments_own_unit_and_goes_on_when_it_was_
     assert closed() == 2
 
 
-def test_a_scan_shows_where_readings_were_taken_and_what_they_bring(arm_file, capsys):
-    true = """return {"value": 140.0, "x_mm": pose.x_mm + 0.25, "y_mm": pose.y_mm - 0.5, "orientation_rad": math.pi / 2,
-            "temperature_c": 20.0 + self.n}"""
-    assert run("arm", "scan", "-50,260", "600,-1e2", "--readings", "2", "--arm", arm_file(true)) == 0
-    header, *rows = (line.split(",") for line in capsys.readouterr().out.splitlines())
-    assert header == ["x_mm", "y_mm", "orientation_deg", "time_s", "reading", "temperature_c"]
-    assert [row[:3] for row in rows] == [["-49.750", "259.500", "90.000"], ["600.250", "-100.500", "90.000"]]
-    assert [row[4:] for row in rows] == [["140", "21"], ["140", "22"]]
-
-
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick_frames")
 def test_a_journal_finds_the_sensor_of_its_run_and_refuses_another_truth(sensor_file, tmp_path, capsys, monkeypatch):

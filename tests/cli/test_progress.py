@@ -74,13 +74,6 @@ def test_what_has_not_changed_is_not_told_again(clock, capsys):
     assert capsys.readouterr().err.splitlines() == ["exploring, thinking about 23 (2 s)", "exploring, moving (150 s)"]
 
 
-def test_a_step_that_takes_long_is_heard_of_while_it_lasts(hurried, capsys):
-    with progress_shown(quiet=False) as progress:
-        progress("drawing the figures")
-        time.sleep(0.1)
-    assert "drawing the figures (0 s)" in capsys.readouterr().err
-
-
 def test_a_terminal_shows_the_stage_its_share_and_the_clock(hurried, monkeypatch):
     terminal = Terminal()
     monkeypatch.setattr(_progress.sys, "stderr", terminal)
@@ -96,25 +89,10 @@ def test_a_terminal_shows_the_stage_its_share_and_the_clock(hurried, monkeypatch
     assert "drawing the figures [00:00], slowly" in shown
 
 
-def test_a_quiet_command_says_nothing(hurried, capsys):
-    with progress_shown(quiet=True) as progress:
-        assert progress is silent
-        time.sleep(0.05)
-    assert capsys.readouterr().err == ""
-
-
 def test_a_program_without_a_console_shows_nothing(monkeypatch):
     monkeypatch.setattr("sys.stderr", None)
     with progress_shown(quiet=False) as progress:
         assert progress is silent
-
-
-def test_nothing_beats_where_a_person_is_asked(hurried, capsys):
-    with progress_shown(quiet=False, beat=False) as progress:
-        time.sleep(0.05)
-        assert capsys.readouterr().err == ""
-        progress("readings", 1, 3)
-    assert capsys.readouterr().err == "readings, 1 of 3 (0 s)\n"
 
 
 def test_a_run_that_is_resumed_tells_how_far_it_is_through_its_journal(sensor_file, tmp_path):

@@ -1,18 +1,16 @@
 """Angles count within the symmetry of their shape: in moments, in the chance of being off, and to the end of a run."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from exploring import run
 
 from probewise.experiment.judgement import (
     probability_of_length_off,
     shape_moments_and_probabilities,
     with_aligned_angles,
 )
-from probewise.experiment.method import SequentialMonteCarlo
 from probewise.nested import Weighted
 from probewise.scene import AnyOf, Circle, Field, Rectangle
 
@@ -59,25 +57,3 @@ def test_of_a_set_of_shapes_each_is_aligned_by_its_own_samples(small):
     _, sd, shapes = shape_moments_and_probabilities(experiment, with_aligned_angles(experiment, posterior))
     assert shapes["rectangle"] == pytest.approx(2 / 3)
     assert sd[[4, 5]] == pytest.approx([0.0, 0.0], abs=1e-9)
-
-
-@dataclass(frozen=True)
-class Counted(SequentialMonteCarlo):
-    """The default method; it writes down how many readings there were when a run asked it for lost modes."""
-
-    asked: tuple[list[int], ...] = ([],)
-
-    def reconsidered(self, posterior, recording, *, rng):
-        self.asked[0].append(len(recording))
-        return super().reconsidered(posterior, recording, rng=rng)
-
-
-def test_a_run_that_trusts_its_sensor_looks_for_lost_modes_before_it_ends(small):
-    asked = []
-    experiment = small.experiment(method=Counted(600, 40, (asked,)))
-    result = run(small.arm(), experiment, rng=np.random.default_rng(5))
-    assert result.target_reached
-    assert set(asked) == {len(result.steps)}
-    plain = run(small.arm(), replace(experiment, method=None), rng=np.random.default_rng(5))
-    assert len(plain.steps) == len(result.steps)
-    np.testing.assert_array_equal(plain.last.mean, result.last.mean)  # it was asked, and had nothing to change

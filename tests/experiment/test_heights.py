@@ -57,19 +57,6 @@ def test_every_height_is_a_design_and_the_lowest_signal_is_strongest(small):
     assert first.reading.covariates["height_mm"] == first.reading.pose.height_mm
 
 
-@pytest.mark.parametrize(
-    ("change", "name"),
-    [
-        ({"calibrated_height_mm": None}, "calibrated_height_mm"),
-        ({"heights_mm": (0.0, 14.0)}, "heights_mm"),
-        ({"heights_mm": (14.0, 1e9)}, "heights_mm is .* 1000000000.0.*calibrated at"),
-    ],
-)
-def test_heights_that_mean_nothing_are_refused(small, change, name):
-    with pytest.raises(ParameterError, match=name):
-        asked(small, **change)
-
-
 LOW_MM, SLOPE = 5.0, 0.01
 CLOSE_WORLD = World(
     gaussian_spot([Blob(1.0, (1.0, 1.5), (4.0, 3.0), 0.0)], pixel_mm=0.5),
@@ -110,21 +97,6 @@ def test_effects_of_the_height_change_that_of_the_calibration(method, arm_mm, cl
     np.testing.assert_allclose(problem.model.predict(TRUTH[None], problem.recording.plan)[0], read, atol=0.5)
     designs = replace(problem.recording.plan, covariates={}, instrumentation=experiment.instrumentation)
     np.testing.assert_allclose(experiment.forecast.predict(TRUTH[None], designs)[0], read, atol=0.5)
-
-
-def test_a_slope_among_the_rivals_is_one_hundredth_of_the_calibrated_height(close_sensor):
-    plain = replace(close_sensor, names=NAMES, samples=SAMPLES, effects=())
-    for sensor, height_mm in ((plain, LOW_MM), (replace(plain, instrumentation=Instrumentation()), 14.0)):
-        experiment = experiment_for(sensor, CIRCLE, FIELD, trust=0.9)
-        (slope,) = [kind.effect for kind in experiment.kinds if kind.left_out == "height_gradient"]
-        assert slope.entries[0, 0, 0] == pytest.approx(0.01 * height_mm / np.hypot(300.0, 200.0))
-
-
-def test_a_journal_names_the_height_only_beside_others_to_choose(small, close_sensor):
-    """Journals of earlier versions did so, and go on."""
-    seed = np.random.SeedSequence(1)
-    assert experiment_for(close_sensor, CIRCLE, FIELD).settings(seed)["options"]["calibrated_height_mm"] is None
-    assert asked(small).settings(seed)["options"]["calibrated_height_mm"] == 14.0
 
 
 class OwnArm:

@@ -16,7 +16,6 @@ from probewise.experiment.judgement import is_target_reached, p_value_and_worst_
 from probewise.experiment.paper import OneScan
 from probewise.inference import GaussianKnown, StudentT
 from probewise.inquiry import Grid, PerSecond, ReadingEntropy, UtilityMap
-from probewise.inquiry.entropy import best_designs_mask
 from probewise.inquiry.smc import prior_particles
 from probewise.recordings import Disc
 from probewise.scene import AnyOf, Circle, Field, Rectangle
@@ -54,25 +53,6 @@ def test_the_robot_finds_the_circle_to_the_precision_it_states(found):
     assert (result.last.sd < 4.0).all()
     assert (np.abs(result.last.mean - truth) < 5 * result.last.sd).all()
     assert result.stop_reason == "every length is known to better than 4 mm"
-
-
-def test_each_step_holds_what_its_reading_taught(found):
-    result, _ = found
-    for number, info in enumerate(result.steps, start=1):
-        assert info.number == number
-        assert info.samples.shape == (20, 3)
-        assert len(np.unique(info.samples, axis=0)) == 20
-        assert 0 <= info.map.highest_utility <= math.log2(50)
-        assert np.isfinite([info.bits, info.log_z, info.p_value, info.posterior.log_z_error]).all()
-        assert info.p_value > 1e-6
-        best = info.map.grid.places_mm[best_designs_mask(info.map.values, info.map.reachable)]
-        assert info.next_pose is None or [info.next_pose.x_mm, info.next_pose.y_mm] in best.tolist()
-    last = result.last  # whose samples are drawn from the posterior: within five standard errors
-    assert (np.abs(last.samples.mean(axis=0) - last.mean) < 5 * last.sd / math.sqrt(20)).all()
-    np.testing.assert_array_equal(result.recording().readings, [r.value for r in result.readings])
-    poses = [info.next_pose for info in result.steps]
-    assert poses[-1] is None
-    assert poses[:-1] == [info.reading.pose for info in result.steps[1:]]
 
 
 def test_a_step_by_hand_is_a_step_of_the_loop(small):
@@ -356,14 +336,6 @@ def one_step(experiment, arm, planned):
     return step(state, arm.measure(state.next_pose), experiment, rng=rng())
 
 
-def test_a_batch_near_the_end_is_the_one_reading_that_may_end_the_run(small, peaked, monkeypatch):
-    there, place = peaked
-    monkeypatch.setattr(inquire, "utility_map", lambda *_: there)
-    state, info = one_step(small.experiment(batch=3, grid=COARSE), small.arm(), ())
-    assert (info.next_pose.x_mm, info.next_pose.y_mm) == place
-    assert state.planned == ()
-
-
 @pytest.mark.parametrize("asks", [False, True])
 def test_a_reading_for_which_the_run_goes_on_is_taken_before_those_planned(small, peaked, monkeypatch, asks):
     there, place = peaked
@@ -374,14 +346,6 @@ def test_a_reading_for_which_the_run_goes_on_is_taken_before_those_planned(small
     monkeypatch.setattr(loop, "must_continue", lambda *_: asks)
     state, info = one_step(experiment, small.arm(), planned)
     assert (info.next_pose, *state.planned) == ((Pose(*place),) if asks else planned)
-
-
-def test_repeats_are_taken_on_the_spot(small):
-    experiment = small.experiment(repeats=(3,), noise_sd=6.0, likelihood=small.gaussian(6.0))
-    result = run(small.arm(), experiment, rng=rng(), max_readings=6)
-    places = [(r.pose.x_mm, r.pose.y_mm) for r in result.readings]
-    assert places[0] == places[1] == places[2] != places[3]
-    assert places[3] == places[4] == places[5]
 
 
 def test_a_run_that_nothing_within_reach_can_advance_stops_and_says_so(small):

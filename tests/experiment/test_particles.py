@@ -10,7 +10,6 @@ from scipy.stats import multivariate_normal
 
 from probewise.arm.instrument import Pose, Reading
 from probewise.experiment.evidence import sampled_about_points
-from probewise.experiment.judgement import information_nats
 from probewise.inquiry.smc import (
     THOROUGH,
     LocalKernels,
@@ -18,7 +17,6 @@ from probewise.inquiry.smc import (
     _EvaluatedSamples,
     _move_by_metropolis,
     prior_particles,
-    resample_and_move,
     update,
 )
 from probewise.nested import run
@@ -124,36 +122,6 @@ def test_a_reading_that_surprises_is_taken_in_from_scratch(small):
     assert len(found.theta) == 500
 
 
-class Window:
-    """Allows readings within five units, and no others."""
-
-    def log_prob(self, readings, predicted):
-        return np.where((np.abs(readings - predicted) < 5.0).all(axis=1), 0.0, -np.inf)
-
-
-def test_hypotheses_that_are_ruled_out_stay_so(small):
-    """A likelihood of zero or one: the evidence is the share of the prior that every reading leaves."""
-    experiment = small.experiment(likelihood=Window())
-    random, posterior = rng(), prior_particles(experiment.prior, 3000, rng=rng(1))
-    readings = [Reading(10.0, Pose(x, y), 0.0) for x, y in ((120.0, 80.0), (300.0, 200.0), (60.0, 250.0))]
-    for n in range(1, 4):
-        posterior = update(posterior, experiment.problem(readings[:n]), rng=random, fall_back=never)
-    posterior = posterior.weighted
-    theta = experiment.prior.from_unit_cube(rng(2).random((200_000, 3)))
-    left = np.isfinite(experiment.problem(readings).log_likelihood(theta)).mean()
-    assert math.exp(posterior.log_z) == pytest.approx(left, rel=5 * posterior.log_z_error + 0.02)
-    assert information_nats(posterior) == pytest.approx(-posterior.log_z)
-
-
-def test_a_missing_reading_changes_nothing(small):
-    before = particles(small, n_particles=300, steps=3)
-    readings = [Reading(v, Pose(x, y), 0.0) for x, y, v in READINGS[:3]]
-    problem = noisy(small).problem([*readings, Reading(math.nan, Pose(10.0, 10.0), 1.0)])
-    after = update(before, problem, rng=rng(), fall_back=never)
-    np.testing.assert_allclose(after.weighted.log_weight, before.weighted.log_weight)
-    assert after.log_z == pytest.approx(before.log_z)
-
-
 @pytest.mark.slow
 def test_what_is_redrawn_has_its_shares_from_the_readings_not_from_where_it_began(small, lattice):
     """Nine in ten of the points are of the half of the posterior where the centre is to the left of its mean."""
@@ -167,23 +135,6 @@ def test_what_is_redrawn_has_its_shares_from_the_readings_not_from_where_it_bega
     assert found.log_z == pytest.approx(log_z, abs=5 * found.log_z_error + 0.05)
 
 
-def test_the_genealogy_tells_when_few_samples_at_the_start_are_ancestors_of_all(small):
-    many = particles(small, n_particles=600, fall_back=None)
-    few = replace(many, ancestor=many.ancestor % 4)
-    assert many.log_z_error < 0.3
-    assert few.log_z_error > 0.4
-
-
-def test_samples_can_be_made_fewer_and_more(small):
-    before, problem = particles(small, steps=3, fall_back=None), problem_of(small, 3)
-    fewer = resample_and_move(before, 1000, problem, rng=rng(1))
-    more = resample_and_move(fewer, 3000, problem, rng=rng(2))
-    assert [len(p.weighted.theta) for p in (fewer, more)] == [1000, 3000]
-    assert len(np.unique(more.weighted.theta, axis=0)) > 2500
-    assert more.log_z == before.log_z
-    np.testing.assert_allclose(more.weighted.mean(), before.weighted.mean(), atol=0.3 * before.weighted.sd().max())
-
-
 def test_kernels_have_the_density_of_the_gaussians_they_draw_from():
     """Two routes to the density: the product of features, and scipy's for each kernel."""
     points = rng().normal(size=(400, 3)) * [30.0, 1.0, 8.0] + [500.0, 200.0, 80.0]
@@ -194,15 +145,6 @@ def test_kernels_have_the_density_of_the_gaussians_they_draw_from():
         for centre, root in zip(kernels.centre, kernels.root, strict=True)
     ]
     np.testing.assert_allclose(kernels.log_density(at), np.log(np.mean(each, axis=0)), atol=1e-4)
-
-
-def test_kernels_follow_a_bent_shell():
-    """Points within 0.2 of a circle of radius 100: draws stay within a few times that, one covariance would not."""
-    angle = rng().uniform(0, 2 * np.pi, 3000)
-    radius = 100.0 + 0.2 * rng(1).standard_normal(3000)
-    points = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
-    away = np.hypot(*LocalKernels.fitted_to(points, rng=rng(2)).draw(2000, rng=rng(3)).T) - 100.0
-    assert np.quantile(np.abs(away), 0.9) < 0.8
 
 
 def test_samples_that_have_collapsed_on_a_point_still_have_kernels_about_it():

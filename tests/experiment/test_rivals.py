@@ -132,14 +132,6 @@ def laws(*names):
     return [rival.likelihood for rival in rivals() if rival.name in names]
 
 
-@pytest.mark.parametrize("law", laws("outliers", "correlated_noise", "flicker"))
-def test_laws_of_the_residual_alone_are_densities(law):
-    """As the level goes over all levels, so does the residual; its density is one."""
-    level = np.linspace(-600.0, 670.0, 60_001)
-    density = np.exp(law.log_prob(np.array([35.0]), level[:, None]))
-    assert np.trapezoid(density, level) == pytest.approx(1.0, abs=1e-3)
-
-
 @pytest.mark.parametrize("law", laws("dropouts", "signal_dependent_noise", "quantisation"))
 def test_laws_of_the_noise_are_densities(law):
     """The density of one reading over all readings is one."""
@@ -526,16 +518,6 @@ def test_a_leader_whose_residuals_change_with_the_place_is_not_believed():
     for readings, said in ((even, ""), (even - 20.0 * (x > 200.0), "changes with the place along X")):
         problem = SimpleNamespace(recording=Recording(plan, readings, ""), model=model)
         assert trend_of_residuals(best, problem) == said
-
-
-@pytest.mark.parametrize("column", ["dark_level.offset", "gain.frac"])
-def test_levels_that_a_sensor_holds_as_changed_are_no_rivals_of_it(sensor, column):
-    name, change = column.partition(".")[0], np.full((len(sensor.samples), 1), 0.1)
-    samples = np.concatenate([sensor.samples, change], axis=1)
-    held = replace(sensor, names=(*sensor.names, column), samples=samples, effects=(name,))
-    field = scene.Field()
-    kinds = experiment_for(held, scene.Circle(field), field, trust=0.9).kinds
-    assert {kind.left_out for kind in kinds}.isdisjoint({name, "dark_level+gain"})
 
 
 def test_the_next_run_starts_with_the_doubt_that_the_last_one_left(sensor):

@@ -4,7 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from probewise.calibration import SSFPrior, blind_axis_rad, default_prior
+from probewise.calibration import SSFPrior, blind_axis_rad, default_prior, scan_geometry
 from probewise.errors import ParameterError
 from probewise.priors import LogUniform, Uniform
 from probewise.recordings import HalfPlane, Recording, paper_plan
@@ -35,6 +35,16 @@ def test_a_gaussian_that_is_not_positive_definite_has_no_density_and_warns_of_no
     theta = prior.from_unit_cube(np.random.default_rng(5).random((50, 14)))
     theta[:, column] = value
     assert (prior.log_prob(theta) == -np.inf).all()
+
+
+def test_the_paper_plan_gives_widths_from_half_a_step_to_a_quarter_of_the_span():
+    g = scan_geometry(_edge_recording())
+    assert (g.step_mm, g.span_mm, g.albedo_low, g.albedo_high, g.inverted) == (1.0, 100.0, 0.0, 1.0, False)
+    prior = default_prior(_edge_recording(), 1)
+    assert isinstance(prior.precision, LogUniform)
+    assert 1 / math.sqrt(2 * prior.precision.high) == pytest.approx(0.5)
+    assert 1 / math.sqrt(2 * prior.precision.low) == pytest.approx(25.0)
+    assert len(prior.table_rows()) == 6
 
 
 def test_levels_are_scaled_from_grey_patterns_to_black_and_white():

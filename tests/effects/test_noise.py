@@ -74,6 +74,11 @@ def test_draws_follow_the_density(name):
         np.testing.assert_allclose(found, wanted, atol=0.012)
 
 
+def test_noise_that_grows_with_the_light_does_so():
+    level = level_of("signal_dependent_noise")
+    np.testing.assert_allclose(level.sd[0, [0, 100]], [SD, SD * np.sqrt(5)], rtol=1e-3)
+
+
 @pytest.mark.parametrize("digits", [2, 3, 6])
 def test_a_lattice_shows_through_printing(digits):
     """Readings rounded to a step that is no round number, then printed: found to a few of its stated errors."""

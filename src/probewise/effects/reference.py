@@ -62,8 +62,8 @@ class Origin:
 
 def origins_of(effects: Iterable[object]) -> dict[str, Origin]:
     """Return the origins of those effects that do not count from 0, by the effect's name."""
-    there = {getattr(effect, "name", ""): getattr(effect, "where", None) for effect in effects}
-    return {name: where.origin for name, where in there.items() if where is not None and where.origin != ZERO}
+    bound = {getattr(effect, "name", ""): getattr(effect, "binding", None) for effect in effects}
+    return {name: own.where.origin for name, own in bound.items() if own is not None and own.where.origin != ZERO}
 
 
 def is_far_from_zero(values: FloatArray, length: float) -> bool:

@@ -282,7 +282,6 @@ def _with_more_gaussians(theta: FloatArray, n_gaussians: int, wanted: int) -> Fl
 _LEAST_OF_AN_ORDER = 0.2  # probability below which an SSF order is left out of the average
 _LEAST_OF_A_RIVAL = 0.02  # probability below which a hypothesis is left out of the average
 _MOST = 6  # hypotheses in one model
-_LEAST_DOUBT = 0.1  # least weight of the null when an unknown effect is repaired by its most similar form
 _DOUBT_BESIDE = 0.5  # weight of the null for a named effect with an unknown effect beside it
 
 
@@ -382,13 +381,17 @@ def draw_models(
     """
     cached, fit, null = HypothesisSamples(searched, best.noise, rng, progress), best.fit, test.null
     by_mean = searched.posterior.marginal_over_noise
+
+    def with_null_for_the_rest(lead: WeighedFit) -> ModelSamples:
+        shares = {names: by_mean.get(names, 0.0) for names in cached.compatible_probabilities(lead) if names}
+        return cached.averaged(lead, {**shares, (): max(1 - sum(shares.values()), 0.0)})
+
     model = samples = cached.averaged(fit)
     if judged.verdict == "unknown":
-        doubt = _DOUBT_BESIDE
         if effects_out_of_vocabulary(fit.names):
-            # What has more beside the formula does not doubt it.
-            doubt = max(1 - sum(p for names, p in by_mean.items() if {*fit.names} <= {*names}), _LEAST_DOUBT)
-        model = cached.averaged(fit, {fit.names: 1 - doubt, (): doubt})
+            model = with_null_for_the_rest(fit)
+        else:
+            model = cached.averaged(fit, {fit.names: 1 - _DOUBT_BESIDE, (): _DOUBT_BESIDE})
     elif judged.verdict in ("named", "cannot_tell") and fit.names:
         model = cached.averaged(fit, cached.compatible_probabilities(fit))
     elif not (judged.too_little or judged.withdrawn):  # no effect is named: the null is what named ones leave
@@ -397,6 +400,5 @@ def draw_models(
         if lead.names and predicts_far_worse(BestRepair.of(searched, test, lead, best.noise, rng=rng).improvement):
             model = cached.averaged(null)
         else:
-            shares = {names: by_mean.get(names, 0.0) for names in cached.compatible_probabilities(lead) if names}
-            model = cached.averaged(lead, {**shares, (): max(1 - sum(shares.values()), 0.0)})
+            model = with_null_for_the_rest(lead)
     return samples if fit is null else cached.averaged(null), samples, model

@@ -116,7 +116,7 @@ TABLES = {
     "a time that is missing": (cell(5, "t_s", ""), "row 5, column t_s: the cell is empty"),
     "a time that falls": (
         cell(5, "t_s", "1"),
-        "column 't_s' in row 5 is 1.0; allowed: 10 or more, since time does not fall within run 1",
+        "column 't_s' in row 5 is 1.0; allowed: 10 or more, since time does not fall within run 1; sort the rows",
     ),
     "no rows": ("run,t_s,power_w,room_c,temp_c\n", "no row below the header"),
 }

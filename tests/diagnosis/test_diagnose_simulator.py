@@ -167,6 +167,23 @@ def test_a_walk_is_named_and_predicted_beyond_its_end():
 
 
 @pytest.mark.slow
+def test_a_bath_that_holds_after_its_row_is_a_lag_without_a_delay():
+    rng, time_s = np.random.default_rng(3), 10.0 * np.arange(60)
+    bath = np.where((np.arange(60) // 15) % 2, 45.0, 20.0)
+    true = [bath[0]]
+    for held in bath[:-1]:
+        true.append(held + (true[-1] - held) * np.exp(-10 / 25))
+    read = 0.6 + 0.98 * np.array(true) + 0.15 * rng.standard_normal(60)
+    thermometer = Simulator(
+        "y", "degC", {"k": (0, 2), "zero": (-5, 5)}, lambda p, u: p["k"] * u["bath"] + p["zero"], time="t"
+    )
+    diagnosis = diagnose_system(thermometer, {"t": time_s, "bath": bath, "y": read}, rng=rng)
+    assert diagnosis.combination == ("lag",)
+    (low, high) = diagnosis.effects[0].parameters[0].interval95
+    assert low < 25 < high
+
+
+@pytest.mark.slow
 def test_known_sds_are_noise_of_the_rows_and_no_outliers():
     """Without the column the loud readings are outliers; with it nothing is wrong."""
     rng = np.random.default_rng(6)

@@ -34,6 +34,15 @@ def test_rows_that_show_an_effect_grow_with_the_square_of_what_is_absorbed(audit
             np.testing.assert_allclose(effect.rows, (8 / effect.share) ** 2, atol=1.0)
 
 
+def test_a_gap_in_a_column_hides_nothing(audit):
+    room = TABLE.columns["room_c"].copy()
+    room[7] = np.nan
+    found = audit_system(heater(), TABLE.with_columns({"room_c": room}))
+    assert [e.name for e in found.effects] == [e.name for e in audit.effects]
+    assert of(found, "sensitivity:room_c").detectability == of(audit, "sensitivity:room_c").detectability
+    assert "gaps of room_c are interpolated" in found.assumed
+
+
 def test_what_needs_a_time_says_so_where_none_was_recorded():
     simulator = heater(time=None, simulate=lambda p, data: p["start_c"] + p["gain"] * data["power_w"] * p["tau_s"])
     found = audit_system(simulator, {**TABLE.columns})

@@ -95,6 +95,17 @@ def test_tables_come_out_as_data_frames(monkeypatch):
     again = Recording.from_table(recording.to_frame(), patterns=recording.plan.patterns, unit="LEGO", min=0, max=100)
     assert again.plan.scan_names == recording.plan.scan_names
     np.testing.assert_array_equal(again.plan.x_mm, recording.plan.x_mm)
+    ramp = probewise.Simulator("y", "V", {"a": (0, 20)}, lambda p, data: p["a"] * data["x"])
+    table, rng = {"x": np.arange(6.0), "y": 3 * np.arange(6.0) + 0.1 * np.cos(np.arange(6))}, np.random.default_rng(1)
+    fit = probewise.fit(table, simulator=ramp, rng=rng, progress=False)
+    assert list(fit.to_frame()) == ["parameter", "mode", "median", "sd", "low", "high"]
+    few = probewise.diagnose(table, simulator=ramp, rng=rng, progress=False)
+    assert sum(few.to_frame()["probability"]) == pytest.approx(1.0)
+    assert few.probability_of("nonlinearity") >= few.probability_of(("nonlinearity",)) > 0
+    audit = probewise.audit(table, simulator=ramp)
+    assert audit.to_frame()["effect"] == [effect.name for effect in audit.effects]
+    planned = probewise.predict(fit, {"x": [7.0, 8.0]}, rng=rng, progress=False)
+    assert "data:image/png;base64" in planned._repr_html_()
     found = run(Bell(), rng=np.random.default_rng(0), n_live=50).to_frame()
     assert list(found) == ["weight", "log_likelihood", "x_mm", "y_mm"]
     monkeypatch.setitem(sys.modules, "pandas", None)

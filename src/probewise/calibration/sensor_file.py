@@ -380,6 +380,8 @@ def read_sensor(path: str | os.PathLike[str]) -> FittedSensor:
 def require_fitted_sensor(sensor: object, more: str = "") -> None:
     """Raise ParameterError unless `sensor` is a FittedSensor; the message says how to get one, and `more`."""
     allowed = "a FittedSensor: read_sensor('sensor.json') of probewise.calibration, or the .sensor of a Calibration"
+    if isinstance(sensor, str) or hasattr(sensor, "__fspath__"):
+        allowed += "; of a simulator read_fitted_system('fitted.json', simulator) of probewise.systems"
     if isinstance(getattr(sensor, "sensor", None), FittedSensor):
         allowed = f"a FittedSensor: take its .sensor, this is the {type(sensor).__name__}"
     elif hasattr(sensor, "repaired"):

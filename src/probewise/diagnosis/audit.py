@@ -16,7 +16,16 @@ from typing import Any, Literal, NamedTuple, TypeAlias, cast, get_args
 
 import numpy as np
 
-from probewise._arrays import MOST_NUMBERS, TINY, FloatArray, IntArray, own_arithmetic, read_only_floats, varies
+from probewise._arrays import (
+    MOST_NUMBERS,
+    TINY,
+    FloatArray,
+    IntArray,
+    data_frame,
+    own_arithmetic,
+    read_only_floats,
+    varies,
+)
 from probewise._display import Reported
 from probewise._kinds import require_one_of
 from probewise.calibration import FittedSensor
@@ -37,7 +46,7 @@ from probewise.diagnosis.sensors import (
 )
 from probewise.diagnosis.simulator_rows import ON_NOISE, SimulatorApparatus
 from probewise.diagnosis.templates import templates_of_effect
-from probewise.diagnosis.words import substitute_reading_unit
+from probewise.diagnosis.words import join_lists, substitute_reading_unit
 from probewise.effects import NUISANCES, VOCABULARY, Effect, Extent, LightEffect, name_of_first_copy
 from probewise.effects.noise import noise_of_runs, noise_per_run, noise_sd
 from probewise.errors import ParameterError, require
@@ -272,6 +281,12 @@ class PlanAudit(Reported):
     def extra_minutes(self) -> float:
         """Duration of the cures in minutes, including the breaks before each scan."""
         return sum(cure.minutes for cure in self.cures)
+
+    def to_frame(self) -> Any:
+        """Return a pandas DataFrame: `effect`, `detectability`, `share` that can be seen, and `reason`, a row each."""
+        names = "detectability", "share", "reason"
+        columns = {name: [getattr(effect, name) for effect in self.effects] for name in names}
+        return data_frame({"effect": [effect.name for effect in self.effects], **columns})
 
     def summary(self) -> str:
         """Return a plain-text summary of the audit."""
@@ -530,6 +545,9 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     own = cast(RunTable, as_recording(simulator, inputs).plan)
     system = System.of(simulator, own)
     z, predicted, where = _point_where_readings_vary(system, own)
+    columns = simulator.inputs(own.covariates)  # that only effects read, since every row is predicted
+    gaps = [name for name, values in columns.items() if 0 < np.isfinite(values).sum() < len(values)]
+    own = own.with_columns({name: own.interpolated_within_runs(columns[name]) for name in gaps})
     sd, noise = _noise_sd_and_source(simulator, own, predicted)
     system = with_converged_step(system, own, system.theta(z[None, :]), tolerance=STANDS_STILL * sd)
     about = ReferenceFit(system, own.with_columns({simulator.reading: predicted}), z, sd)
@@ -543,6 +561,7 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     reasons = _reasons_for_absence(about)
     names = dict.fromkeys([*forms, *(name for name in reasons if name not in forms), *on_noise])
     assumed = f"{simulator.source or 'the simulator'} at {where}, noise {sd:.3g} {simulator.unit} ({noise})"
+    assumed += f"; gaps of {join_lists(gaps)} are interpolated" if gaps else ""
     expected = Expected(cast(Null, system), z, sd, lambda _: built, assumed)
     bank = expected.bank(cast(Plan, own), most=_SETTINGS_OF_TABLE)
     rows = np.arange(len(own))

@@ -530,12 +530,16 @@ def diagnose_system(
     def diagnosed(simulator: Simulator, *, stiff: bool = False, sought: frozenset[str] | None = None) -> Diagnosis:
         prepared = prepare_system(simulator, table, source=source, notes=notes, progress=progress, stiff=stiff)
         prepared = replace(prepared, sought=sought)
-        told = progress_with_call_count(progress, cast(SimulatorApparatus, prepared.apparatus).system.caller)
+        caller = cast(SimulatorApparatus, prepared.apparatus).system.caller
+        told = progress_with_call_count(progress, caller)
         searched = None
         if prepared.has_too_little_data:  # the verdict is that they cannot tell, whatever a search would find
             prior = prepared.apparatus.prior_odds(prepared.effects)
             searched = replace(search(replace(prepared, effects={}), prior=prior, progress=told), prepared=prepared)
-        return diagnose_prepared(prepared, searched=searched, thorough=thorough, progress=told, rng=rng)
+        diagnosis = diagnose_prepared(prepared, searched=searched, thorough=thorough, progress=told, rng=rng)
+        if caller is not None:
+            caller.on_call = None  # what the result is asked later is no progress of this diagnosis
+        return diagnosis
 
     diagnosis = diagnosed(simulator)
     needed = finer_step_for_repair(diagnosis)

@@ -16,7 +16,7 @@ from typing import Any, TypeAlias, cast
 
 import numpy as np
 
-from probewise._arrays import FloatArray, own_arithmetic, read_only_floats
+from probewise._arrays import FloatArray, data_frame, own_arithmetic, read_only_floats
 from probewise._display import Reported
 from probewise._kinds import checked_texts, require_kind, require_like, require_one_of, require_progress, require_rng
 from probewise.diagnosis.advice import NextMeasurement, choose_next_measurement, is_settled
@@ -290,6 +290,11 @@ class Diagnosis(Judged, Reported):
         plan = asked.plan
         patterns = {name: plan.patterns.get(name, polygon) for name in plan.pattern_names}
         return replace(self, next_measurement=replace(asked, plan=replace(plan, patterns=patterns)))
+
+    def to_frame(self) -> Any:
+        """Return a pandas DataFrame of the explanations: `effects`, `words` and `probability`, a row each."""
+        told = [("+".join(h.effects), hypothesis_in_words(h.effects), h.probability) for h in self.hypotheses]
+        return data_frame(dict(zip(("effects", "words", "probability"), zip(*told, strict=True), strict=True)))
 
     def summary(self) -> str:
         """Describe the diagnosis in plain text."""

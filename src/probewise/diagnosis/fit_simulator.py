@@ -10,7 +10,7 @@ from typing import Any, cast
 import numpy as np
 
 from probewise import nested
-from probewise._arrays import FloatArray, own_arithmetic
+from probewise._arrays import FloatArray, data_frame, own_arithmetic
 from probewise._display import Reported
 from probewise._kinds import require_flag, require_kind, require_progress, require_rng
 from probewise.diagnosis.diagnose_simulator import modes_of, notes_on_simulator, prepare_system
@@ -138,6 +138,13 @@ class SystemFit(Reported):
         """Root mean square of the residuals, in the unit of the readings; weighted where a column holds their sds."""
         return self.recording.rms(self.residuals[self.recording.usable])
 
+    def to_frame(self) -> Any:
+        """Return a pandas DataFrame: `mode`, `median`, `sd`, `low`, `high` (95 %) of each parameter, a row each."""
+        own = self.fitted
+        low, high = zip(*own.interval().values(), strict=True)
+        columns = {name: getattr(own, name)().values() for name in ("mode", "median", "sd")}
+        return data_frame({"parameter": own.names, **columns, "low": low, "high": high})
+
     def summary(self) -> str:
         """Describe the fit in plain text."""
         own, unit = self.fitted, self.recording.plan.instrumentation.unit
@@ -235,6 +242,8 @@ def fit_simulator(
     fitted = replace(fitted, best=tuple(system.theta(modes[:1])[0].tolist()))
     evidence = Evidence(draws.log_z, max(draws.log_z_error, _LEAST_ERROR), "importance sampling")
     beside = _nested(problem, z, rng=rng, progress=progress) if thorough else None
+    if system.caller is not None:
+        system.caller.on_call = None
     return SystemFit(recording, fitted, evidence, mean, sd, beside)
 
 

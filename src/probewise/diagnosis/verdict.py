@@ -165,9 +165,14 @@ class Judged:
         ]
         return tuple(sorted(beside, key=lambda h: -h.probability))
 
-    def probability_of(self, effects: Names) -> float:
-        """Return the probability of a hypothesis, 0 of one that is not among those compared."""
-        return next((h.probability for h in self.hypotheses if h.effects == effects), 0.0)
+    def probability_of(self, effects: Names | str) -> float:
+        """Return the probability of a hypothesis, 0 of one that is not among those compared.
+
+        Of a name alone, as "lag", it is the probability that this effect acts, whatever acts beside it.
+        """
+        if isinstance(effects, str):
+            return sum(h.probability for h in self.hypotheses if effects in h.effects)
+        return next((h.probability for h in self.hypotheses if h.effects == tuple(effects)), 0.0)
 
     @property
     def unknown_probability(self) -> float:

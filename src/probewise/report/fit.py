@@ -70,8 +70,9 @@ def page_html(fit: SystemFit, drawn: Mapping[str, bytes], *, seed: int | None) -
         (name, *value_and_interval_texts(value, *interval[name]), typeset_numbers(f"{mode[name]:.8g}"))
         for name, value in zip(own.names, median, strict=True)
     ]
+    of_file = f", from {own.source}" if own.source else ""
     run = {
-        "readings": f"{int(fit.recording.usable.sum())} used of {len(fit.recording)}, from {own.source}",
+        "readings": f"{int(fit.recording.usable.sum())} used of {len(fit.recording)}{of_file}",
         "simulator": own.simulator.source or "given in Python",
         "noise sd of a reading": f"{np.median(own.noise_sd):.4g} {unit_after_number(own.simulator.unit)}",
     }
@@ -79,7 +80,7 @@ def page_html(fit: SystemFit, drawn: Mapping[str, bytes], *, seed: int | None) -
     facts = [*run.items(), *(("log evidence", said) for said in evidences), *seed_fact(seed).items()]
     residuals = figure(drawn["residuals.svg"], "Recorded minus predicted reading, with running means.")
     return page(
-        f"Fit of {own.source}",
+        f"Fit of {own.source or own.simulator.reading}",
         answer=summary_sentence(fit),
         key_figure=figure(drawn["predicted.svg"], "Recorded against predicted readings; on the line they agree."),
         sections=[

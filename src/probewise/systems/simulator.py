@@ -165,7 +165,7 @@ class Simulator:
     noise
         Prior knowledge of the noise; may be a dict with some of "sd", "step", "range", "zero".
     extra
-        The user's own effects, by name.
+        The user's own effects, by name: each an `Extra`, or as in FILE.py a dict with "prior", "null" and "says".
     vectorized
         Whether `simulate` takes parameters (n_samples, 1), those of `per_run` (n_samples, n_points), and returns
         (n_samples, n_points). False: trial calls find out.
@@ -184,7 +184,7 @@ class Simulator:
     per_run: tuple[str, ...] = ()
     controls: tuple[str, ...] = ()
     noise: Noise = field(default_factory=Noise)
-    extra: Mapping[str, Extra] = field(default_factory=dict)
+    extra: Mapping[str, Any] = field(default_factory=dict)
     vectorized: bool = False
     source: str = ""
     fingerprint: str = ""
@@ -228,13 +228,16 @@ class Simulator:
             for state, start in self.law.states.items():
                 is_start = start in self.parameters if isinstance(start, str) else _is_finite_number(start)
                 require(is_start, f"states[{state!r}]", start, f"a number or a parameter: {names}")
-        require_mapping("extra", self.extra, "effects by name: {'drag': Extra(prior, null, says)}")
+        require_mapping("extra", self.extra, "effects by name: {'drag': {'prior': ..., 'null': 0, 'says': ...}}")
         own = given["extra"] = {}
         for name, effect in self.extra.items():
-            require_kind(f"extra[{name!r}]", effect, Extra, "an Extra(prior, null, says), of probewise.systems")
-            own[name] = replace(effect, prior=parse_prior(f"extra[{name!r}].prior", effect.prior))
+            if isinstance(effect, Mapping) and effect.keys() == {"prior", "null", "says"}:
+                effect = Extra(effect["prior"], effect["null"], str(effect["says"]))
+            require_kind(f"extra[{name!r}]", effect, Extra, 'a dict with "prior", "null" and "says"')
             is_null = _is_finite_number(effect.null)
             require(is_null, f"extra[{name!r}].null", effect.null, "a finite number, at which it is absent")
+            prior = parse_prior(f"extra[{name!r}].prior", effect.prior)
+            own[name] = replace(effect, prior=prior, null=float(effect.null))
             require(name not in self.parameters, "extra", name, "names that no parameter has")
             allowed = f"names that no effect of this program has: {', '.join(_TAKEN)}"
             require(name not in _TAKEN, "extra", name, allowed)
@@ -292,17 +295,12 @@ def run_simulator_text(text: str, path: Path) -> Simulator:
     given: dict[str, Any] = dict.fromkeys(("reading", "unit", "parameters"))
     given |= {name: said[name] for name in _OF_SYSTEM if name in said}
     try:
-        law, extra, effects = None, said.get("extra", {}), {}
-        require_mapping("extra", extra, 'effects by name, each a dict with "prior", "null" and "says"')
+        law = None
         if "rates" in said or "states" in said:
             of_law: dict[str, Any] = {"states": None} | {name: said[name] for name in _OF_LAW if name in said}
             law = Law(rates=rates, observe=observe, **of_law)
-        for name, own in extra.items():
-            is_whole = isinstance(own, Mapping) and own.keys() == {"prior", "null", "says"}
-            require(is_whole, f"extra[{name!r}]", own, 'a dict with "prior", "null" and "says"')
-            effects[name] = Extra(own["prior"], float(own["null"]), str(own["says"]))
         given |= {"source": printable(path.name), "fingerprint": fingerprint_of_text(text)}
-        return Simulator(simulate=simulate, law=law, extra=effects, **given)
+        return Simulator(simulate=simulate, law=law, extra=said.get("extra", {}), **given)
     except ParameterError as error:
         found = f"{error.name} is {shown(error.value)}" if error.value is not None else f"{error.name} is missing"
         like = get_close_matches(error.name, said.keys() - set(_NAMES), 1) if error.value is None else []

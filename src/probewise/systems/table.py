@@ -82,7 +82,8 @@ class RunTable:
 
     def __post_init__(self) -> None:
         allowed = "columns by name: a dict of arrays, or a data frame; of a file: read_run_table('DATA.csv', ...)"
-        require(hasattr(self.columns, "items"), "table", self.columns, allowed)
+        has_one_axis = getattr(self.columns, "ndim", 2) == 1  # a Series, whose items are its rows
+        require(hasattr(self.columns, "items") and not has_one_axis, "table", self.columns, allowed)
         columns, notes = dict[str, NDArray[Any]](), [*self.notes]
         for name, given in self.columns.items():
             values: Any = given
@@ -185,7 +186,7 @@ class RunTable:
                 before, at = rows[falls[0]], rows[falls[0] + 1]
                 where = f"column {self.time!r} in row {at + self.first_line}"
                 anew = 'its run; where it begins anew name the runs: run = "..."'
-                own = anew if self.run is None else f"run {name}"
+                own = anew if self.run is None else f"run {name}; sort the rows"
                 allowed = f"{self.time_s[before]:g} or more, since time does not fall within {own}"
                 raise ParameterError(where, float(self.time_s[at]), allowed)
 

@@ -32,11 +32,20 @@ def test_a_smooth_reading_lags_as_its_differential_equation_says(tau):
     assert np.abs(held - exact).max() > 3 * np.abs(smooth - exact).max()
 
 
-def test_a_reading_that_is_held_between_rows_lags_by_the_share_of_each_gap():
+@pytest.mark.parametrize(("between", "holds"), [(0.0, slice(1, None)), (2.0, slice(None, -1))])
+def test_a_reading_that_holds_before_or_after_its_row_lags_by_the_share_of_each_gap(between, holds):
     x, tau, expected = _reading(_T), 0.4, [_reading(_T[0])]
-    for gap, value in zip(np.diff(_T), x[1:], strict=True):
+    for gap, value in zip(np.diff(_T), x[holds], strict=True):
         expected.append(expected[-1] + (1 - np.exp(-gap / tau)) * (value - expected[-1]))
-    np.testing.assert_allclose(lagged_readings(x[None], np.array([[tau, 0.0]]), _rows())[0], expected)
+    np.testing.assert_allclose(lagged_readings(x[None], np.array([[tau, between]]), _rows())[0], expected)
+
+
+@pytest.mark.parametrize("between", [0.0, 1.0, 2.0])
+def test_no_lag_changes_nothing_also_where_rows_share_a_time(between):
+    t = np.repeat(np.arange(5.0), 2)
+    table, x = RunTable({"t": t, "y": t}, time="t", run=None), _RNG.normal(size=(1, 10))
+    np.testing.assert_array_equal(lagged_readings(x, np.array([[0.0, between]]), table), x)
+    assert np.isfinite(lagged_readings(x, np.array([[0.3, between]]), table)).all()
 
 
 @pytest.mark.parametrize("act", [lagged_readings, delayed_readings])
@@ -80,8 +89,9 @@ def test_a_lag_and_a_delay_have_a_smooth_variant_where_rows_are_not_dense_beside
     assert len(dense["delay"].variants()) == 1
 
 
-def test_the_smooth_variant_has_a_twentieth_of_the_prior_of_the_first():
+def test_the_variants_have_a_twentieth_and_a_half_of_the_prior_of_the_first():
     """So that a lag and a delay are no less probable where rows are held than what explains the same readings."""
     variants = prepare_system(*_cups(0.8, 0.6)).effects["lag"].variants()
-    templates = EffectTemplates((), (), variants, np.array([0, 0, 1]))
-    np.testing.assert_allclose(templates.variant_probabilities(np.log([3.0, 1.0, 4.0])), [20 / 21, 1 / 21])
+    templates = EffectTemplates((), (), variants, np.array([0, 0, 1, 2]))
+    found = templates.variant_probabilities(np.log([3.0, 1.0, 4.0, 2.0]))
+    np.testing.assert_allclose(found, np.array([20, 1, 5]) / 26)

@@ -55,7 +55,7 @@ SAME_MODE = 0.02  # nats by which another fit of the null must be better to be a
 # Nats behind the best refit: a fit so far behind is weighed once, and one of a law that stays there is given up. Where
 # an effect gains hundreds of nats, others gain some of them slowly, and most steps of a search were theirs.
 FAR_BEHIND = 40.0
-_FEW_VARIANTS = 2  # of an effect, which are all refitted: screening is no judge of a bound
+_FEW_VARIANTS = 3  # of an effect, which are all refitted: screening is no judge of a bound
 _VARIANTS_TRIED = 0.05  # of the leading variant's weight: the next, of an effect bound to scans, is refitted too
 _MOST_FAULTS = 3  # of the noise at once
 _MANY = 12  # nodes of one effect above which they are thinned before combination with another's

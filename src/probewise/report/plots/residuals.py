@@ -14,7 +14,6 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.errors import require
 from probewise.recordings import Recording
 from probewise.recordings.plan import require_recording
 from probewise.report.plots import canvas
@@ -178,10 +177,13 @@ def recorded_against_predicted(
 ) -> Axes:
     """Draw each reading (NaN: none) against its prediction, with one sd of a new reading, (n_points,) each.
 
-    `label` and `unit` are those of the readings.
+    Where nothing was read, the predictions are drawn row by row. `label` and `unit` are those of the readings.
     """
     there = np.isfinite(readings)
-    require(there.any(), "readings", readings, "one reading or more")
+    if not there.any():
+        ax = canvas.axes_or_new(ax)
+        ax.errorbar(np.arange(len(predicted)), predicted, yerr=_SD_95 * sd, fmt="o", ms=3, lw=0.8, color=canvas.BLUE)
+        return canvas.finish(ax, x="row, from 0", y=f"predicted {label} ({unit}), 95 %", plain="y")
     ax = canvas.axes_or_new(ax, size_in=(canvas.PANEL_IN, 4.2))
     x, y = predicted[there], readings[there]
     ax.errorbar(x, y, yerr=sd[there], fmt="o", ms=3, lw=0.8, color=canvas.BLUE, alpha=0.6, label="readings, ± 1 sd")

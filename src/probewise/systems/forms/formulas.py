@@ -50,7 +50,7 @@ _THRESHOLDS = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9)  # quantiles of a state beyond w
 _SAME = 0.9999  # cosine of two terms over the rows above which only the shorter one is kept
 _MOST_SQUARE_WAVES = 160  # periods of a square wave that are tried
 _ROWS_OF_A_WAVE = 6  # least rows per period: with fewer a square wave is not told from a sinusoid
-_SOFT = 0.3  # steepness of its edges to begin with; at 1 it is nearly a sinusoid, and up to 0.5 its tops are flat
+_SOFT = 0.5  # steepness of its edges to begin with; to 0.6 its tops are flat to a tenth, at 1 it is nearly a sinusoid
 _MOST_SWEPT = 40  # waves in the recording of which the frequency may change: faster ones would need gigabytes
 _SWEEPS = 1.5  # changes of the frequency that are tried, per wave in the recording: phases to within a radian
 _N_DOSES = 9  # doses that are tried as the one at which the reading has changed by 1 - 1/e of the whole change
@@ -312,7 +312,7 @@ def _square_wave_form(about: ReferenceFit) -> Iterator[Effect]:
             "hz": (frequency_prior(frequencies), f"1/{about.time_unit}"),
             "phase": (Uniform(-1.0, 1.0), "1"),
             "share": (Uniform(0.03, 0.97), "1"),
-            "edge": (LogUniform(0.03, 0.5), "1"),
+            "edge": (LogUniform(0.03, 0.6), "1"),
         },
         change,
         ("time",),

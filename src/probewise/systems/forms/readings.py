@@ -39,9 +39,11 @@ from probewise.systems.forms.modulations import (
 from probewise.systems.forms.reference import N_SIZES, Clipping, ReferenceFit, flag, switch_points
 from probewise.systems.table import RunTable, covariate_of_column
 
-_SMOOTH = "smooth"  # name of the parameter that is 0 for the first variant, and 1 for the smooth one
-_ODDS_OF_SMOOTH = 0.05  # prior: the rows of most tables are dense beside what matters
-_APART = 1.0  # lambda between the two at some trial size, below which they are the same
+_SMOOTH = "smooth"  # name of the parameter that distinguishes the variants of a reading that comes late
+# Prior odds: a reading takes over in the gap before its row, or (1) is smooth, though the rows of most tables are dense
+# beside what matters, or (2) holds from its row on, as what was set there does.
+_ODDS_OF_VARIANTS = 1.0, 0.05, 0.5
+_APART = 1.0  # lambda from the first variant at some trial size, below which another one is the same
 _BEND_DEGREE = 4
 _COEFFICIENTS = "a1", "a2", "a3", "a4", "a5"  # of a curve
 _HARDLY = 1e-6  # of a size: more than rounding of none
@@ -65,8 +67,8 @@ def _cubics(time: FloatArray, values: FloatArray) -> FloatArray:
     return out
 
 
-def _late_form(about: ReferenceFit, name: str, act: Act, tried: FloatArray, says: str) -> Iterator[Effect]:
-    """Yield the form of a reading that comes late, with a smooth variant where rows tell it."""
+def _late_form(about: ReferenceFit, name: str, act: Act, tried: FloatArray, says: str, n: int) -> Iterator[Effect]:
+    """Yield the form of a reading that comes late, with those of its `n` variants that rows tell from the first."""
 
     def at_rows(value: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
         return np.asarray(act(value, np.append(theta, np.zeros_like(theta), axis=1), table))
@@ -75,16 +77,19 @@ def _late_form(about: ReferenceFit, name: str, act: Act, tried: FloatArray, says
     if prior is None:
         return
     variants: list[Effect] = []
-    for is_smooth in (False, True):
-        value, of_flag = flag(is_smooth, odds=_ODDS_OF_SMOOTH if is_smooth else 1.0)
+    for k, odds in enumerate(_ODDS_OF_VARIANTS[:n]):
+        value, of_flag = flag(k, odds)
         own: Declared = {"tau_s": (prior, about.time_unit), _SMOOTH: (of_flag, "1")}
         words = in_words(f"{about.system.simulator.reading} {says}", about.time_unit)
         bank = single_column_bank(sizes_inside(prior, N_SIZES, 1.2), value)
         given = (name, Stage.LAG, own, ("previous",), act, words, bank)
         variants += about.form(*given, absent={0: 0.0}, needs_rising_time=True)
-    first, second = (act(about.predicted[None, :], each.entries[:, 0], about.table) for each in variants)
-    apart = np.sqrt(np.nansum((first - second)[:, about.has_reading] ** 2, axis=1)) / about.sd
-    yield replace(variants[0], alternatives=(variants[1],)) if apart.max() > _APART else variants[0]
+    first, *others = (act(about.predicted[None, :], each.entries[:, 0], about.table) for each in variants)
+    apart = [
+        np.sqrt(np.nansum((first - other)[:, about.has_reading] ** 2, axis=1).max()) / about.sd for other in others
+    ]
+    told = (variant for variant, by in zip(variants[1:], apart, strict=True) if by > _APART)
+    yield replace(variants[0], alternatives=tuple(told))
 
 
 def within_runs(change: Act) -> Act:
@@ -104,15 +109,16 @@ def within_runs(change: Act) -> Act:
 def lagged_readings(x: FloatArray, theta: FloatArray, time: FloatArray) -> FloatArray:
     """Return readings that lag by first order, (n_samples, n_points); each run begins without a lag.
 
-    `theta` (n_samples, 2) is the time constant, and above 0.5 for readings that are smooth between the rows.
+    `theta` (n_samples, 2) is the time constant, and what readings do between the rows: those of a row hold in the gap
+    before it (0), are smooth (1), or hold in the gap after it (2).
     """
     if len(time) < 2:
         return x
-    tau, smooth, gaps = theta[:, :1], theta[:, 1:2] > 0.5, np.diff(time)
+    tau, between, gaps = theta[:, :1], np.round(theta[:, 1:2]), np.diff(time)
     with np.errstate(divide="ignore"):
         carry = np.where(tau > 0, np.exp(-gaps / np.where(tau > 0, tau, 1.0)), 0.0)
-    gain = (1 - carry) * x[:, 1:]
-    if smooth.any():
+    gain = (1 - carry) * np.where((between == 2) & (tau > 0), x[:, :-1], x[:, 1:])
+    if (smooth := between == 1).any():
         gain = np.where(smooth & (gaps > 0), _gain_of_smooth_readings(time, x, tau, carry), gain)
     added, kept = np.insert(gain, 0, x[:, 0], axis=1), np.insert(carry, 0, 0.0, axis=1)
     return decaying_sum(added, kept, longest=len(time))
@@ -189,8 +195,8 @@ def forms_on_readings(about: ReferenceFit) -> Iterator[Effect]:
         yield from wave_form(about, "interference", reading)
         yield from _settling_form(about)
         lags, dead = np.geomspace(0.02, 200.0, 33), np.geomspace(1e-3, 100.0, 41)
-        yield from _late_form(about, "lag", lagged_readings, lags, "lags with a time constant of {0}")
-        yield from _late_form(about, "delay", delayed_readings, dead, "is delayed by {0}")
+        yield from _late_form(about, "lag", lagged_readings, lags, "lags with a time constant of {0}", 3)
+        yield from _late_form(about, "delay", delayed_readings, dead, "is delayed by {0}", 2)
     for name in about.varying_columns:
         yield from form_along_column(about, f"sensitivity:{name}", reading, name)
         yield from _curve_form(about, name)

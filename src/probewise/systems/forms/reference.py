@@ -45,9 +45,9 @@ N_SIZES = 9  # in the bank of a form of one size
 _LEAST, _MOST = 0.05, 1e4  # rms change in noise sds between which sizes without an amplitude are searched
 
 
-def flag(on: bool, odds: float = 1.0) -> tuple[float, Fixed]:
-    """Return the value of a parameter that distinguishes two variants of a form, 0 or 1 to 1e-9, and its prior."""
-    value = 1.0 - 0.5 * ROUNDING if on else 0.5 * ROUNDING
+def flag(number: int, odds: float = 1.0) -> tuple[float, Fixed]:
+    """Return the value of a parameter that distinguishes variants of a form, 0, 1 or 2 to 1e-9, and its prior."""
+    value = number - 0.5 * ROUNDING if number else 0.5 * ROUNDING
     return value, Fixed(value - 0.5 * ROUNDING, value + 0.5 * ROUNDING, odds)
 
 

@@ -197,6 +197,8 @@ def checked_output_file(path: Path, *inputs: Path | None, option: str = "--out")
     for taken in inputs:
         if taken is not None and path.exists() and taken.exists() and path.samefile(taken):
             raise ParameterError(option, str(path), f"another file than the input {taken}")
+    if path.exists() and not os.access(path, os.W_OK):
+        raise FileError(path, "is write-protected", "a file that you may write to, or a new one")
     if not is_device_or_pipe(path):
         checked_output_directory(Path(os.path.realpath(path)).parent, option=option)
     return path

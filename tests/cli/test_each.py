@@ -51,6 +51,17 @@ def test_each_recording_has_a_row_and_a_folder_and_is_diagnosed_once(tmp_path, m
         assert "a,refused,,,,,again" in (out / "table.csv").read_text().splitlines()
 
 
+def test_a_folder_that_cannot_be_written_to_is_told_with_what_is_kept(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("probewise.cli.diagnose._diagnosed", lambda words: ("", {"diagnosis.json": b"{}"}))
+    (tmp_path / "line.py").write_text(LINE)
+    files = [write_line(tmp_path / "a.csv"), write_line(tmp_path / "b.csv")]
+    (tmp_path / "out" / "b" / "diagnosis.json").mkdir(parents=True)
+    words = ["--simulator", str(tmp_path / "line.py"), "--each", "--out", str(tmp_path / "out")]
+    assert main(["diagnose", *files, *words]) == 2
+    assert "in the way; allowed: another folder, or none there; " in (said := capsys.readouterr().err)
+    assert "go on with: probewise diagnose" in said
+
+
 def test_names_that_cannot_name_a_folder_and_one_with_other_results_are_refused(tmp_path, capsys):
     law, out = tmp_path / "line.py", tmp_path / "out"
     law.write_text(LINE)

@@ -10,7 +10,7 @@ import pytest
 from command import content_of, refused, run
 from heater import fitted
 
-from probewise._writing import staged_output
+from probewise._writing import checked_output_file, staged_output
 from probewise.errors import FileError
 from probewise.recordings import read_recording, write_bytes_atomically, write_recording
 
@@ -195,6 +195,13 @@ def test_a_file_keeps_its_permissions_and_a_new_one_has_those_of_any_new_file(tm
     (tmp_path / "new").chmod(0o640)
     write_bytes_atomically(tmp_path / "new", b"2")
     assert stat.S_IMODE((tmp_path / "new").stat().st_mode) == 0o640
+
+
+def test_a_write_protected_file_is_not_replaced(tmp_path, monkeypatch):
+    (tmp_path / "p.csv").touch(mode=0o444)
+    monkeypatch.setattr(os, "access", lambda path, mode: path.stat().st_mode & stat.S_IWUSR)  # as of anyone but root
+    with pytest.raises(FileError, match="is write-protected; allowed: a file that you may write to, or a new one"):
+        checked_output_file(tmp_path / "p.csv")
 
 
 def test_files_beside_the_named_one_follow_no_link(recording_file, tmp_path):

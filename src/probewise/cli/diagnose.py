@@ -150,7 +150,7 @@ def _diagnose_each(arguments: argparse.Namespace) -> int:
 
     kept = partial(message_to_resume, out, n_done, "recording", arguments, of=len(files))
     with (
-        reporting_what_is_kept(kept),
+        reporting_what_is_kept(kept, results=True),
         progress_of(arguments) as progress,
         open_executor(arguments) as executor,
         results_as_tasks_end(_diagnosed, words, executor) as ended,

@@ -13,9 +13,9 @@ def test_the_matrix_marks_the_row_that_is_taken_for_the_column_and_leaves_out_wh
     rows = [label.get_text() for label in matrix.figure.axes[0].get_yticklabels()]
     assert rows == ["outliers  1", "backlash  2", "lag  3"]
     image = np.ma.filled(matrix.images[0].get_array(), np.nan)
-    assert (image[2, 1], image[1, 2]) == (0.97, 0.3)
+    assert [label.get_text() for label in matrix.get_xticklabels()] == ["2", "3"]  # of the effects compared
+    assert (image[2, 0], image[1, 1]) == (0.97, 0.3)
     assert np.isnan(image[0]).all()
-    assert np.isnan(image[:, 0]).all()
     (circle,) = zip(*matrix.lines[0].get_data(), strict=True)
-    assert circle == (1, 2)
+    assert circle == (0, 2)
     assert "row: the effect present" in matrix.get_title(loc="left")

@@ -34,7 +34,7 @@ from probewise.recordings.table import csv_text, number_text, read_table
 LEAST_MARKS = 5
 """Least number of marks, with place and height, that determine the nine parameters of the geometry."""
 
-_COLUMNS, _ROWS = (0.1, 0.3, 0.5, 0.7, 0.9), (0.12, 0.45, 0.75)
+_COLUMNS, _ROWS = ((0.1, 0.53, 0.9), (0.7, 0.3)), (0.12, 0.45, 0.75)
 _STEP_MM = 10.0
 _TURNED = tuple(f"{joint}_turned_deg" for joint in JOINTS)
 _PLACE = ("x_mm", "y_mm", "height_mm")
@@ -70,13 +70,8 @@ def spread_mark_places(geometry: Geometry) -> FloatArray:
     Returns shape (n_marks, 2), in mm. Raises ReachError if fewer than five are within reach.
     """
     width, height = geometry.field_mm
-    # Every second place of a grid, as on a chessboard, so that no two rows have the same base angles.
-    grid = [
-        (x * width, y * height)
-        for row, y in enumerate(_ROWS)
-        for column, x in enumerate(_COLUMNS if row % 2 == 0 else _COLUMNS[::-1])
-        if (row + column) % 2 == 0
-    ]
+    # Nearly as on a chessboard, so that no two rows have the same base angles; none on a border of A4 pages.
+    grid = [(x * width, y * height) for row, y in enumerate(_ROWS) for x in _COLUMNS[row % 2]]
     marks = np.round(np.array(grid) / _STEP_MM) * _STEP_MM
     marks = marks[geometry.contains(marks)]
     if len(marks) < LEAST_MARKS:

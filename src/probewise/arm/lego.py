@@ -347,10 +347,10 @@ class DryRun:
         self.release()
 
     def move_to(self, joint: int, goal: int, side: Side) -> None:
-        self._check_and_print_move(joint, goal, "up" if side > 0 else "down")
+        self._check_and_print_move(joint, goal, f"exact, from {'below' if side > 0 else 'above'}")
 
     def move_near(self, joint: int, goal: int) -> None:
-        self._check_and_print_move(joint, goal, "roughly")
+        self._check_and_print_move(joint, goal, "to within some counts")
 
     def release(self) -> None:
         self._say("release all motors")

@@ -162,11 +162,11 @@ def _jog_joint_or_sensor(arguments: argparse.Namespace, geometry: Geometry) -> N
                 if arguments.steps and not arguments.dry_run:
                     _bench.confirm_each_step_down(arm)
                 (arm.go_down if arguments.down else arm.go_over)(x_mm, y_mm)
-                _print_position(arguments, arm)
                 if arguments.down:
-                    _bench.prompter_unless_dry_run(arguments, arm)(
-                        "check the sensor's position; it will be raised again"
-                    )
+                    _print_position(arguments, arm)
+                    _bench.prompter_unless_dry_run(arguments, arm)("check place and height before the sensor rises")
+                    arm.raise_sensor()
+                _print_position(arguments, arm)
         case [joint, text] if joint in JOINTS:
             (degrees,) = parse_finite_numbers("WHERE", text, 1, "a number of degrees")
             with _bench.open_lego_arm(arguments, geometry) as arm:
@@ -322,6 +322,10 @@ def _touch_and_save_marks(arguments: argparse.Namespace, geometry: Geometry, kep
     kept_message = partial(message_to_resume, kept, taken.__len__, "mark", arguments, "--resume")
     with reporting_what_is_kept(kept_message), hold_lock(kept), instrument as arm:
         answer, tell = _bench.prompter_for_answer(arm), print_result if bench is None else lambda text: None
+
+        def ask_for_move(mark: str) -> str:
+            return answer(f"{mark}, sensor {arm.position_mm[2]:.1f} mm up: ")
+
         if bench is None:
             _bench.prompter(arm)(
                 "lay the sheet of marks (probewise sheets marks) on the field, and on each cross in its turn a "
@@ -330,7 +334,7 @@ def _touch_and_save_marks(arguments: argparse.Namespace, geometry: Geometry, kep
         for number, mark in enumerate(marks, 1):
             if mark in done:
                 continue
-            ask = partial(answer, f"mark {number} of {len(marks)} ({mark[0]:g}, {mark[1]:g}): ")
+            ask = partial(ask_for_move, f"mark {number} of {len(marks)} ({mark[0]:g}, {mark[1]:g})")
             if bench is not None:
                 ask = partial(bench.answer_at_mark, mark, arguments.block_mm)
             met = bring_to_mark(arm, mark, arguments.block_mm, ask, tell)

@@ -95,12 +95,16 @@ def draw_views(searches: Mapping[str, Exploration], n: int) -> AxesGrid:
     axes = grid_of_axes(1, len(searches), size_in=(PAGE_IN, 1.6 + 3.6 * (high - low) / (right - left)))
     for ax, (name, run) in zip(axes[0], searches.items(), strict=True):
         step = steps[name]
-        title = f"{name}, {count_with_noun(step.number, 'reading')}: sd up to {_sd_text(step)}"
+        done = ", done" if step is run.last else ""
+        title = f"{name}, {count_with_noun(step.number, 'reading')}{done}: sd up to {_sd_text(step)}"
         draw_view_after(run, step.number, title=title, ax=ax).set(xlim=(left, right), ylim=(low, high))
         (columns,), (rows,) = (np.nonzero((at >= a) & (at <= b)) for at, a, b in sides)
         if np.isfinite(step.map.image[np.ix_(rows, columns)]).all():
             for patch in ax.patches:  # no place out of reach is in this part
                 patch.set_label("")
+    most = max(ax.images[0].get_clim()[1] for ax in axes[0])
+    for ax in axes[0]:  # one scale, to compare
+        ax.images[0].set_clim(0.0, most)
     draw_field_legend(axes)
     return axes
 

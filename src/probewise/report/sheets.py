@@ -156,7 +156,8 @@ def marks_sheet(geometry: Geometry) -> Sheet:
     marks = spread_mark_places(geometry)
     lines = (
         f"{len(marks)} crosses for `probewise arm fit-geometry`, numbered",
-        "its lower left corner is the field's; its long sides run along the field's x axis",
+        "its lower left corner is the field's; its long sides run along the field's x axis; the base turns about "
+        f"x = {geometry.axis_mm[0]:g}, y = {geometry.axis_mm[1]:g}",
     )
     frame = "the field's lower left corner"
     return Sheet("marks", Uniform(1.0), (0.0, 0.0), geometry.field_mm, lines, crosses_mm=marks, frame=frame)
@@ -173,7 +174,8 @@ def arm_home_jig_sheet(geometry: Geometry) -> Sheet:
         "the links at home, from the side, outwards to the right",
         "glue it on card, cut it at y = 0, stand it on the table beside the",
         "links, the base's axis at x = 0; bring the joints' axles to the crosses;",
-        f"the base is at {math.degrees(base):.4g} degrees from the field's x axis",
+        "pages without a cross carry the others",
+        f"the base is at {math.degrees(base):.4g} degrees from the field's x axis (-90: straight over the field)",
     )
     axis, table = [[0.0, max(low[1], 0.0)], [0.0, high[1]]], [[low[0], 0.0], [high[0], 0.0]]
     return Sheet(

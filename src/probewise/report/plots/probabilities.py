@@ -17,6 +17,7 @@ from probewise.report.plots import canvas
 _SHOWN = 6  # hypotheses with a colour of their own in the bars of rounds
 _VISIBLE = 0.02  # probability from which a hypothesis has one
 _LETTERS = 44  # of a line of a bar's label
+_MOST_NUMBERS = 24  # on an axis
 _DETECTABILITY = {"fine": canvas.BLUE, "aliased": canvas.ORANGE, "invisible": canvas.GREY}
 
 
@@ -30,7 +31,9 @@ def hypothesis_probabilities(
     order = np.argsort(-np.asarray(probabilities), kind="stable")
     shown = [(names[i], float(probabilities[i])) for i in order[:most]]
     if len(order) > most:
-        shown.append((f"{len(order) - most} others", float(np.sum(np.asarray(probabilities)[order[most:]]))))
+        shown.append(
+            (f"the {len(order) - most:,} others together", float(np.sum(np.asarray(probabilities)[order[most:]])))
+        )
     ax = canvas.axes_or_new(ax, size_in=(canvas.PANEL_IN, height_of_bars_in([name for name, _ in shown])))
     # Labels in lines: the layout gives them the room that they take.
     at, labels = np.arange(len(shown)), [textwrap.fill(name, _LETTERS) for name, _ in shown]
@@ -123,11 +126,15 @@ def audit_matrix(
     canvas.label_axes(bars, x="detectable share (no unit)", y="")
     shown = np.where(cosines > 0, cosines, np.nan)[np.ix_(order, order)]
     np.fill_diagonal(shown, np.nan)
+    is_compared = np.isfinite(shown).any(axis=0)
+    compared = np.flatnonzero(is_compared) if is_compared.any() else at
+    shown = shown[:, compared]
     image = matrix.imshow(shown, cmap=canvas.COPPER, vmin=0, vmax=1, aspect="auto")
     row, column = np.nonzero(shown >= alias)
     matrix.plot(column, row, "o", markersize=4, color="white", markeredgecolor=canvas.BLACK)
-    matrix.set_xticks(at, [str(place) for place in at + 1], fontsize=canvas.SMALL_PT, rotation=90)
-    canvas.add_colour_bar(matrix, image, f"cosine (no unit); circles from {alias:g} on")
+    ticks = np.arange(len(compared))[:: 1 + len(compared) // _MOST_NUMBERS]
+    matrix.set_xticks(ticks, [str(place) for place in compared[ticks] + 1], fontsize=canvas.SMALL_PT)
+    canvas.add_colour_bar(matrix, image, f"cosine (no unit); circles: aliased, {alias:.2f} or more")
     title = "row: the effect present; blank: not compared"
     canvas.label_axes(matrix, x="number of the effect it may be mistaken for", y="", title=title)
     canvas.legend_below(axes)

@@ -74,7 +74,7 @@ def playing_field(
         ax.add_collection(LineCollection(list(outlines_mm), colors=_OUTLINE_BLUE, linewidths=0.7, alpha=0.75))
         ax.plot([], [], color=_OUTLINE_BLUE, label=f"{len(outlines_mm)} hypotheses drawn from the posterior")
     if truth_mm is not None:
-        ax.plot(*truth_mm.T, color="white", linewidth=1.4, linestyle=(0, (5, 3)), label="the true target")
+        ax.plot(*truth_mm.T, color="white", linewidth=1.2, linestyle=(0, (3, 5)), label="the true target")
     for n, corners in enumerate(cards_mm):
         label = "" if n else "known card"
         ax.add_patch(Polygon(corners, fill=False, edgecolor=_CARD_YELLOW, linewidth=1.4, hatch="//", label=label))
@@ -86,7 +86,8 @@ def playing_field(
             "edgecolors": np.where(shade < 0.5, _DARK_EDGE, canvas.BLACK),
         }
         ax.scatter(places_mm[:, 0], places_mm[:, 1], s=34, marker="s", linewidths=0.9, zorder=3, **colours)
-        for name, colour, rim in (("dark reading", "black", _DARK_EDGE), ("bright reading", "white", canvas.BLACK)):
+        for name, colour in (("dark reading", "black"), ("reading between", "#909090"), ("bright reading", "white")):
+            rim = _DARK_EDGE if colour == "black" else canvas.BLACK
             ax.plot([], [], "s", color=colour, markersize=6, markeredgecolor=rim, label=name)
     if next_mm is not None:
         style: dict[str, Any] = {

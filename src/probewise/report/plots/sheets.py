@@ -144,7 +144,7 @@ def _draw_page(sheet: Sheet, tiles: Sequence[Tile], tile: Tile, first: int, numb
     white = {"boxstyle": "square,pad=0.2", "fc": "white", "ec": "none"}  # legible on black
     for axis, there in enumerate(((tile.column + 1, tile.row), (tile.column, tile.row + 1))):
         if there in numbers:  # on the strip that the neighbour covers
-            x, y = (near + far) / 2
+            x, y = (near + 3 * far) / 4  # beside what is drawn in the middle
             x, y = (far[0] + OVERLAP_MM / 2, y) if axis == 0 else (x, far[1] + OVERLAP_MM / 2)
             style: dict[str, Any] = {"fontsize": _SMALL, "ha": "center", "va": "center", "bbox": white, "zorder": 5}
             ax.text(x, y, f"page {numbers[there]} lies here", rotation=90 * (1 - axis), **style)
@@ -171,8 +171,9 @@ def _draw_sheet_part(ax: Axes, sheet: Sheet, low_mm: Any, high_mm: Any, place: A
     if not isinstance(sheet.pattern, Uniform | HalfPlane | Quadrant | Disc | Polygon | Stripes):
         _draw_raster(ax, sheet.pattern, low_mm, high_mm, place)
     outline = [] if sheet.outline_mm is None else [np.concatenate([sheet.outline_mm, sheet.outline_mm[:1]])]
-    for line in (*outline, *lines_of_crosses(sheet), *sheet.strokes_mm):
-        (drawn,) = ax.plot(*place(line).T, color=BLACK, lw=0.4, solid_capstyle="butt", zorder=2)
+    thin = [(line, 0.4) for line in (*outline, *lines_of_crosses(sheet))]
+    for line, width in (*thin, *((line, 1.2) for line in sheet.strokes_mm)):
+        (drawn,) = ax.plot(*place(line).T, color=BLACK, lw=width, solid_capstyle="butt", zorder=2)
         drawn.set_clip_path(clip)
     crosses = [] if sheet.crosses_mm is None else sheet.crosses_mm.tolist()
     names = sheet.cross_names or [f"{k}: ({x:g}, {y:g})" for k, (x, y) in enumerate(crosses, start=1)]
@@ -181,7 +182,8 @@ def _draw_sheet_part(ax: Axes, sheet: Sheet, low_mm: Any, high_mm: Any, place: A
         if (low_mm[0] <= x < high_mm[0]) and (low_mm[1] <= y < high_mm[1]):
             at_x, at_y = place(np.array([[x, y]]))[0].tolist()
             fits = at_x + _LETTER_MM * len(words) < place(np.array([high_mm]))[0, 0]
-            written = ax.text(at_x, at_y, words, fontsize=_SMALL, zorder=2, ha="left" if fits else "right")
+            at_x, ha = (at_x, "left") if fits else (at_x - 20.0, "right")  # on the other side of the cross
+            written = ax.text(at_x, at_y, words, fontsize=_SMALL, zorder=2, ha=ha)
             written.set_clip_path(clip)
 
 

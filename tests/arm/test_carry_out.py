@@ -1,7 +1,6 @@
 """A plan carried out by the arm: row after row, a person asked where there is something to do."""
 
 import dataclasses
-import math
 
 import numpy as np
 import pytest
@@ -11,14 +10,12 @@ from probewise.arm import (
     LegoArm,
     Pose,
     Reading,
-    SimulatedArm,
     carry_out,
     read_geometry,
     readings_of_recording,
     recording_of_readings,
     shipped_geometry_path,
 )
-from probewise.arm.carry_out import duration_s
 from probewise.errors import ReachError
 from probewise.recordings import paper_plan
 
@@ -41,19 +38,6 @@ class Told:
 @pytest.fixture
 def told():
     return Told()
-
-
-def thinned(plan, step=20):
-    """Every twentieth row and the last four, the quadrants."""
-    return plan.take(np.r_[0 : len(plan) - 4 : step, len(plan) - 4 : len(plan)])
-
-
-def test_a_whole_turn_takes_no_time():
-    plan = thinned(paper_plan())
-    turned = dataclasses.replace(plan, orientation_rad=plan.orientation_rad + math.tau * (np.arange(len(plan)) % 2))
-    arm = SimulatedArm(lambda pose, time_s, height_mm: 10.0)
-    with arm:
-        assert duration_s(arm, turned, origin_mm=ORIGIN) == duration_s(arm, plan, origin_mm=ORIGIN)
 
 
 def test_a_plan_that_the_arm_cannot_reach_moves_nothing(told):

@@ -164,16 +164,6 @@ def test_the_radio_is_given_time_to_turn_round(link, script):
     np.testing.assert_allclose(np.diff(script.sent_at[2:]), [0.06, 0.06, 0.06, 0.08, 0.015], atol=1e-9)
 
 
-def test_a_long_run_keeps_the_brick_awake(link, script, clock):
-    """Every minute, though only questions are asked, which do not restart the brick's sleep timer."""
-    for asleep in (False, False, True):
-        clock.sleep(20.0)
-        if asleep:
-            script.expect(ASLEEP, (0.06, AWAKE))
-        script.expect(LIGHT, (0.06, BRIGHT))
-        link.ask(read)
-
-
 @pytest.mark.parametrize(("limit", "waits_s"), [("30 75 00 00", (9.0, 1.1)), ("00 00 00 00", (59.0, 1.1))])
 def test_a_brick_is_kept_awake_as_often_as_its_limit_needs(script, clock, limit, waits_s):
     """With one of 30 s, which no menu has, every 10 s; one that never sleeps is asked every minute."""

@@ -28,14 +28,6 @@ def at_port(paper_brick, clock, monkeypatch):
     return paper_brick
 
 
-def test_check_asks_a_brick_who_it_is_and_moves_nothing(at_port, capsys):
-    out = said(capsys, "arm", "check", "--arm", "nxt:x").out
-    assert "brick        ARM1, firmware 1.31, battery 7.41 V" in out
-    assert "light        56 LEGO units (1 dark to 100 bright) at port 1, 500 raw counts" in out
-    assert not at_port.drives()
-    assert not at_port.is_open
-
-
 @pytest.mark.filterwarnings("default::probewise.errors.LowBatteryWarning")
 def test_check_warns_of_an_empty_battery(at_port, capsys):
     at_port.millivolt = 5900

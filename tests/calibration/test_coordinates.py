@@ -25,23 +25,6 @@ CASES = pytest.mark.parametrize(("n_gaussians", "by_mass"), [(1, False), (1, Tru
 
 
 @CASES
-def test_coordinates_lead_back_to_the_gaussians_sorted_by_mass(n_gaussians, by_mass):
-    belief = prior(n_gaussians, by_mass=by_mass)
-    space = belief.coordinates
-    theta = belief.from_unit_cube(np.random.default_rng(2).random((50, len(belief.names))))
-    x = space.enter(theta)
-    back, log_density = space.leave(x)
-    assert np.isfinite(log_density).all()
-    g = back[:, :-2].reshape(50, n_gaussians, 6)
-    mass = g[..., 0] / np.sqrt(g[..., 3] * g[..., 4] - g[..., 5] ** 2)
-    assert (np.diff(mass, axis=1) <= 0).all()
-    # The same Gaussians in another order.
-    ours, theirs = np.sort(g[..., 1], axis=1), np.sort(theta[:, :-2].reshape(50, n_gaussians, 6)[..., 1], axis=1)
-    assert ours == pytest.approx(theirs, rel=1e-9, abs=1e-9)
-    assert space.enter(back) == pytest.approx(x, abs=1e-9)
-
-
-@CASES
 def test_the_density_is_the_priors_times_the_volume_that_coordinates_stretch(n_gaussians, by_mass):
     """The Jacobian by central differences; N! for the labellings that became one."""
     belief = prior(n_gaussians, by_mass=by_mass)

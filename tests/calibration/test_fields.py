@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from probewise.calibration import mixture_moments, posterior_mean_ssf_field
+from probewise.calibration import choose_pixel_mm, mixture_moments, posterior_mean_ssf_field
 from probewise.errors import ParameterError, ShapeError
 
 ONE = np.array([[1.0, 0.5, 1.5, 0.03, 0.08, -0.01]])
@@ -13,6 +13,14 @@ def test_a_footprint_too_wide_for_the_grid_gets_wider_pixels():
     field = posterior_mean_ssf_field(wide, 1, pixel_mm=0.1)
     assert field.pixel_mm > 0.1
     assert max(field.values.shape) <= 302
+
+
+def test_the_pixel_is_a_millimetre_and_finer_for_fine_scans_and_narrow_footprints():
+    wide = ONE * [1, 1, 1, 0.3, 0.1, 0.1]
+    assert choose_pixel_mm(wide, 1, step_mm=1.0) == 1.0
+    assert choose_pixel_mm(wide, 1, step_mm=5.0) == 1.0
+    assert choose_pixel_mm(wide, 1, step_mm=0.05) == 0.05
+    assert choose_pixel_mm(np.array([[1.0, 0, 0, 0.5, 0.5, 0.0]]), 1, step_mm=1.0) == 0.2
 
 
 def test_moments_of_a_mixture_are_those_of_its_field():

@@ -131,3 +131,10 @@ def test_what_is_no_sensor_at_all_is_refused(tmp_path, content):
 def test_a_sensor_must_hold_together(sensor, change, message):
     with pytest.raises((ParameterError, ShapeError), match=message):
         replace(sensor, **change(sensor))
+
+
+def test_the_summary_names_every_parameter_and_the_preferred_order(sensor):
+    text = _full(sensor).summary()
+    assert all(name in text for name in sensor.names)
+    assert "-320.50 ± 0.30  most probable" in text
+    assert "something to know" in text

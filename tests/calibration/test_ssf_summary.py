@@ -27,6 +27,14 @@ def test_widths_and_angle_are_those_that_the_covariance_was_made_of(angle_deg):
     assert medians == pytest.approx([0.3, 1.5, 4.0, 2.4, angle_deg], abs=1e-9)
 
 
+def test_an_axis_has_no_direction():
+    """Angles on either side of 90 degrees are neighbours: their interval is narrow."""
+    found = by_name([parameters(4.0, 2.4, angle) for angle in np.linspace(84.0, 98.0, 50)])["angle_deg"]
+    low, high = found.interval95
+    assert high - low == pytest.approx(14.0, abs=0.8)
+    assert found.median % 180.0 == pytest.approx(91.0, abs=0.2)
+
+
 def test_two_gaussians_are_summed_up_as_a_whole_and_one_by_one():
     """Two alike, 6 mm apart along u: the variances between and within add up."""
     rows = [[*parameters(2.0, 1.0, 0.0, (-3.0, 0.0), 3.0), *parameters(2.0, 1.0, 0.0, (3.0, 0.0), 1.0)]] * 3

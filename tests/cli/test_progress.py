@@ -64,16 +64,6 @@ def test_lines_begin_after_two_seconds_and_come_every_five(clock, capsys):
     ]
 
 
-def test_what_has_not_changed_is_not_told_again(clock, capsys):
-    lines = _progress._TextProgress()
-    for note in ("thinking about 23", "moving"):
-        lines("exploring", note=note)
-        for _ in range(150):
-            clock[0] += 1.0
-            lines.refresh()
-    assert capsys.readouterr().err.splitlines() == ["exploring, thinking about 23 (2 s)", "exploring, moving (150 s)"]
-
-
 def test_a_terminal_shows_the_stage_its_share_and_the_clock(hurried, monkeypatch):
     terminal = Terminal()
     monkeypatch.setattr(_progress.sys, "stderr", terminal)

@@ -248,17 +248,6 @@ def test_false_alarms_stay_within_the_binomial():
     assert sum(alarms) <= 8
 
 
-def test_a_free_ssf_takes_up_what_blurs_every_edge_alike():
-    """Not where a part of the readings is taken from another height."""
-    plan, blur = two_way_plan(), VOCABULARY["edge_blur"]
-    heights = np.where(np.arange(len(plan)) < 400, np.nan, 20.0)
-    for height_mm, absorbed in ((None, True), (heights, False), (np.full(len(plan), 20.0), True)):
-        commanded = {} if height_mm is None else {"height_mm": height_mm}
-        assert (
-            blur.is_absorbed_by_ssf(dataclasses.replace(plan, covariates={**plan.covariates, **commanded})) == absorbed
-        )
-
-
 @pytest.mark.slow
 def test_without_an_alarm_nothing_is_named_and_predictions_are_averaged_all_the_same(monkeypatch):
     monkeypatch.setattr("probewise.diagnosis.verdict.bayes_factor_p_value", lambda *_: 0.2)

@@ -217,19 +217,6 @@ def test_an_effect_that_could_not_show_is_not_built():
 OF_MOUNTINGS = ("scan_angle_error", "height_offset")
 
 
-def test_effects_of_a_mounting_may_sit_in_each_mounting_and_each_scan():
-    names = PLAN.scan_names
-    at_90 = tuple(name for name in names if "90" in name)
-    for name in OF_MOUNTINGS:
-        effect = VOCABULARY[name].for_extent(EXTENT)
-        found = [variant.scans for variant in effect.variants()]
-        assert at_90 in found
-        assert [scans for scans in found if len(scans) == 1] == [(name,) for name in names]
-        assert len(found) == len(set(found)) == len(names) + 4
-    misplaced = VOCABULARY["scan_misplacement"].for_extent(EXTENT)
-    assert [v.scans for v in misplaced.variants()] == [(name,) for name in names]
-
-
 @pytest.mark.parametrize(
     ("written_deg", "as_deg"),
     [

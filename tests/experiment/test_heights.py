@@ -11,7 +11,7 @@ from hand_made import NAMES, sensor_of
 
 from probewise.arm import Pose, Reading, as_instrument
 from probewise.errors import DoubtfulResultWarning, ParameterError
-from probewise.experiment import arm_over, experiment_for, explore, result_json
+from probewise.experiment import experiment_for, explore, result_json
 from probewise.inference import GaussianKnown
 from probewise.inquiry import Grid
 from probewise.recordings import Disc, Instrumentation
@@ -42,19 +42,6 @@ def asked(small, **changes):
         "calibrated_height_mm": 14.0,
     }
     return small.experiment(**(options | changes))
-
-
-def test_every_height_is_a_design_and_the_lowest_signal_is_strongest(small):
-    experiment = asked(small)
-    assert [design.settings for design in experiment.designs.setting_combinations] == [
-        (("height_mm", h),) for h in HEIGHTS
-    ]
-    arm = arm_over(replace(WORLD, noise_sd=1.0), DISC, FIELD, seed=1)
-    with arm:
-        first = next(explore(arm, experiment, rng=np.random.default_rng(1)))
-    best = first.map.values.reshape(len(HEIGHTS), -1).max(axis=1)
-    assert best[0] > best[1]
-    assert first.reading.covariates["height_mm"] == first.reading.pose.height_mm
 
 
 LOW_MM, SLOPE = 5.0, 0.01

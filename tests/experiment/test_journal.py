@@ -111,14 +111,6 @@ def test_a_new_journal_never_overwrites_a_file(tmp_path):
     assert (tmp_path / "j").read_text() == "precious"
 
 
-def test_every_setting_that_differs_is_named(tmp_path):
-    write(tmp_path / "j", 1)
-    journal = read_journal(tmp_path / "j")
-    require_same_settings(journal, SETTINGS)
-    with pytest.raises(FileError, match=r"seed '7' there, '8' here; shape 'Circle\(\)' there, 'Square\(\)' here"):
-        require_same_settings(journal, {**SETTINGS, "seed": "8", "shape": "Square()"})
-
-
 def test_a_journal_becomes_a_recording_over_the_field(tmp_path):
     write(tmp_path / "j", 3)
     disc, lego = Disc((1.0, 2.0), 30.0), Instrumentation(min=1, max=100, step=1)

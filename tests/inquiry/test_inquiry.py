@@ -94,15 +94,6 @@ def test_an_inquiry_is_settled_when_every_sd_is_reached():
     assert 2 < len(asked.readings) < 20
 
 
-def test_seconds_count():
-    """Twice the information at the far end is not worth ten times the seconds; travel counts from the last setting."""
-    assert inquiry(cost_s=[1, 1, 1, 1, 10.0]).next() == 1.5
-    asked = inquiry(cost_s=lambda last: np.ones(5) if last is None else 0.01 + 100 * np.abs(PLACES - last))
-    asked.tell(0.3, 1.0)
-    assert asked.next() == 1.0
-    assert asked.utility_label.endswith("per second")
-
-
 def test_a_reading_without_its_setting_is_taken_once_for_each_choice():
     asked = inquiry()
     for _ in range(2):
@@ -146,26 +137,6 @@ def test_settings_come_back_in_the_form_they_were_given(name):
 def plain_root(p, x):
     """Takes numbers, not arrays: of one sample, at one setting."""
     return p["offset"] + math.sqrt(x) if x > 0.5 else p["offset"] + p["slope"] * x
-
-
-def one_sample(p, x):
-    """Takes one sample at all settings."""
-    return np.array([p["offset"] + (p["slope"] if p["slope"] > 0 else 0.0) * each for each in np.atleast_1d(x)])
-
-
-def arrays_of_one_sample(p, x):
-    return p["offset"] + np.where(p["slope"] > 0, p["slope"], 0.0) * x
-
-
-def test_a_function_of_one_sample_gives_what_arrays_give():
-    told = [(1.0, 0.7), (2.0, 1.1)]
-    means = []
-    for model in (one_sample, arrays_of_one_sample):
-        asked = inquiry(model=model)
-        for setting, reading in told:
-            asked.tell(reading, setting)
-        means.append(asked.posterior.mean())
-    np.testing.assert_array_equal(*means)
 
 
 def test_a_function_of_numbers_alone_is_asked_setting_by_setting():

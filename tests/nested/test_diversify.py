@@ -8,17 +8,6 @@ from probewise.errors import ParameterError, ShapeError
 from probewise.nested import diversify
 
 
-def test_exact_draws_stay_exact_draws_and_forget_where_they_began():
-    problem = problems.gaussian(2, correlation=0.9)
-    rng = np.random.default_rng(12)
-    start = rng.multivariate_normal([0, 0], [[1, 0.9], [0.9, 1]], size=2000)
-    end = diversify(start, problem, rng=rng, n_steps=150)
-    assert np.cov(end, rowvar=False) == pytest.approx(np.array([[1, 0.9], [0.9, 1]]), abs=0.12)
-    assert abs(np.corrcoef(start[:, 0], end[:, 0])[0, 1]) < 0.1
-    # Of independent samples the mean square difference is twice the variance.
-    assert ((end - start) ** 2).mean() / 2 == pytest.approx(1.0, abs=0.15)
-
-
 def test_samples_pass_between_modes():
     problem = problems.mixture_of_far_peaks(2)
     rng = np.random.default_rng(13)

@@ -3,7 +3,7 @@
 import importlib
 import multiprocessing
 import sys
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 
@@ -13,7 +13,7 @@ from nested_sampling import problems
 from runs import assert_same, quiet
 
 from probewise.errors import NotConvergedError
-from probewise.nested import Evaluator, KernelMove, NestedResult, SliceMove
+from probewise.nested import Evaluator, NestedResult
 from probewise.priors import Product, Uniform
 
 checked = partial(quiet, n_live=50, max_cost=5.0)
@@ -77,14 +77,6 @@ class AtOnce(Executor):
             future.set_exception(error)
         self.inside = False
         return future
-
-
-@pytest.mark.parametrize("move", [SliceMove(), KernelMove()])
-def test_the_result_does_not_depend_on_the_executor(move, processes, slopes):
-    alone = checked(slopes.Slope(), move=move)
-    with ThreadPoolExecutor(3) as threads:
-        for executor, n_workers in ((threads, None), (processes, 5)):
-            assert_same(checked(slopes.Slope(), move=move, executor=executor, n_workers=n_workers), alone)
 
 
 def test_any_executor_will_do_and_gets_even_parts_of_the_check_too():

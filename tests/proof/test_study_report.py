@@ -46,30 +46,6 @@ def test_the_csv_holds_every_number_and_its_bounds(study):
         assert "cpu" not in ",".join(row)
 
 
-def test_each_curve_is_the_median_of_its_runs():
-    widths = [np.array([100.0, 10.0, 2.0]), np.array([200.0, 50.0, 30.0, 3.0]), np.array([300.0, 3.0])]
-    axes = report.posterior_widths_of_runs({"some": widths, "other": widths[:2]})
-    assert axes.shape == (1, 2)
-    for ax in axes.flat:
-        (own,) = (line for line in ax.lines if line.get_label() == "median")
-        (other,) = (line for line in ax.lines if line.get_label() == "median of another panel")
-        assert own.get_linewidth() > other.get_linewidth()
-    (median,) = (line for line in axes[0, 0].lines if line.get_label() == "median")
-    # A run that has ended stays at its last width.
-    np.testing.assert_allclose(median.get_ydata(), [200.0, 10.0, 3.0, 3.0])
-    assert "mm" in axes[0, 0].get_ylabel()
-
-
-def test_what_rows_need_is_drawn_with_its_bounds(study):
-    axes = report.readings_needed({row.name: found for row, found in summaries(study).items()})
-    assert [text.get_text() for text in axes[0, 0].get_yticklabels()] == [row.name for row in ROWS]
-    assert len(axes[0, 0].containers) == 2
-    low, high = sorted(axes[0, 0].get_ylim())
-    assert low <= -0.5
-    assert high >= len(ROWS) - 0.5
-    assert len(axes[0, 1].containers) == 1
-
-
 @pytest.mark.slow
 def test_a_page_of_one_row_has_no_empty_table_and_none_wider_than_a_page(study):
     one = {trial: result for trial, result in study.items() if trial.row == ROWS[1]}

@@ -72,15 +72,6 @@ def test_a_repair_that_does_not_predict_is_said_not_to():
     assert page._heldout_gain_in_words(0.1, 0.1).startswith("No better than before")
 
 
-def test_residuals_are_averaged_in_even_steps_with_their_chance():
-    """Ten thousand readings of a step of two: the means stand at 0 and 2 in steps of the covariate."""
-    x = np.linspace(0.0, 1.0, 10_000)
-    means = mean_residuals(x, 2.0 * (x > 0.5), None, sd=1.0)
-    np.testing.assert_allclose(np.diff(means.at), 1 / 24, rtol=0.01)
-    np.testing.assert_allclose(means.before, 2.0 * (means.at > 0.5), atol=0.01)
-    np.testing.assert_allclose(means.chance, 1.96 / np.sqrt(means.size))
-
-
 @pytest.mark.slow
 def test_the_band_of_chance_holds_ninety_five_of_a_hundred_means_after_a_fit():
     """A straight line fitted to noise: what it absorbs, by its posterior samples, makes the band narrower."""

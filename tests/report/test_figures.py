@@ -6,7 +6,6 @@ import subprocess
 import sys
 from types import SimpleNamespace
 
-import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
@@ -22,7 +21,6 @@ from probewise.proof.concealed_study import ConcealedRow
 from probewise.recordings import Recording, read_recording, shipped
 from probewise.report import plots
 from probewise.report.exploration import animated_gif
-from probewise.report.plots import canvas
 from probewise.report.residual_means import mean_residuals
 from probewise.sensor import SSFField
 
@@ -236,14 +234,6 @@ def test_predictions_get_a_panel_a_scan_and_one_for_the_readings_alone(recording
     assert sum(ax.get_visible() for ax in axes.flat) <= 8
 
 
-def test_the_field_shows_readings_by_brightness_and_the_next_place():
-    ax = plots.playing_field(**field())
-    squares, green = ax.collections[1:]
-    np.testing.assert_allclose(squares.get_facecolors()[:, :3], [[0, 0, 0], [1, 1, 1]])
-    np.testing.assert_allclose(green.get_offsets(), [[700.0, 300.0]])
-    assert "mm" in ax.get_xlabel()
-
-
 @pytest.mark.slow
 def test_probabilities_that_are_not_drawn_one_by_one_are_added_up():
     ax = plots.hypothesis_probabilities([str(k) for k in range(20)], np.full(20, 0.05), most=8)
@@ -285,17 +275,6 @@ def test_frames_follow_each_other():
 def test_the_same_drawing_gives_the_same_bytes():
     first, second = (plots.svg(plots.heldout_gain_by_scan([("edge_0", 0.5)], 0.2, 0.05)) for _ in range(2))
     assert first == second
-
-
-def test_a_name_is_drawn_as_it_is_written_whatever_style_is_set():
-    """Neither as a formula, nor by LaTeX, which may not be there; powers along a logarithmic axis are formulas."""
-    with mpl.rc_context({"text.usetex": True}):
-        ax = canvas.axes_or_new(None)
-        ax.plot([1, 1000])
-        ax.set(yscale="log", xlabel=r"$\frac{1}$ of $5 in a_b, %")
-        drawn = canvas.svg(ax).decode()
-    assert r"$\frac{1}$ of $5 in a_b, %" in drawn
-    assert r"$\mathdefault{10^{2}}$" in drawn
 
 
 def test_rounded_readings_lie_on_their_lattice():

@@ -45,15 +45,6 @@ def test_a_value_shows_a_picture(make):
     assert "data:image/png;base64" in make()._repr_html_()
 
 
-def test_a_value_without_a_renderer_shows_its_escaped_summary():
-    class Plain(ShowsItself):
-        def summary(self):
-            return "a < b\nand more"
-
-    assert Plain()._repr_html_() == "<pre>a &lt; b\nand more</pre>"
-    assert repr(Plain()) == "<Plain: a < b>"
-
-
 def test_what_has_no_picture_says_so():
     with pytest.raises(ParameterError, match="one with a picture"):
         ShowsItself().plot()

@@ -78,14 +78,6 @@ def test_a_single_case_conceals_its_effect_at_its_size():
     assert abs(noise.std() - 1) < 4 / np.sqrt(2 * len(noise))
 
 
-def test_a_case_with_an_effect_on_the_noise_has_no_other_kind_of_noise():
-    noise_only = SINGLES.index("correlated_noise")
-    made = case(number_of("single", size=8.0, other_noise=True, skip=noise_only))
-    assert made.combination == ("correlated_noise",)
-    assert made.noise_model == "white"
-    assert made.hidden[0].size_lambda == pytest.approx(8.0, rel=0.02)
-
-
 def test_a_pair_is_two_effects_that_can_be_told_apart():
     truth = case(number_of("pair"))
     assert len(truth.combination) == 2

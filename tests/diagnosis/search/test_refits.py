@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from refitted import state_with_nulls
 
-from probewise.diagnosis import posterior
 from probewise.diagnosis import search as searching
 from probewise.diagnosis.diagnose_simulator import prepare_system
-from probewise.diagnosis.search import search_with_formulas
 from probewise.diagnosis.search.hypotheses import (
     Evidences,
     hypothesis_probabilities,
@@ -95,21 +92,6 @@ def prepared_line():
     return _line(lambda u: 0.3 * (u["room"] - u["room"].mean()))
 
 
-def test_a_formula_is_searched_for_where_a_name_explains_a_part(monkeypatch):
-    """0.3 of the room's deviation, and its product with the force, of lambda about 10, which has no name."""
-
-    def change(u):
-        room = u["room"] - u["room"].mean()
-        return 0.3 * room + 0.02 * room * (u["force"] - u["force"].mean())
-
-    searched = searching.search(_line(change))
-    asked = []
-    monkeypatch.setattr(searching, "search", lambda more, **k: asked.append(more.effects) or searched)
-    search_with_formulas(searched)
-    assert asked
-    assert any(name.startswith("formula:") and "room" in name for name in asked[0])
-
-
 def _refit_favoured(state):
     def posterior():
         own = Evidences(state.candidates, state.screened_log_evidences())
@@ -149,20 +131,3 @@ def test_what_was_not_refitted_promises_no_more_than_the_refits_kept(prepared):
     assert len(left) >= 2
     assert all(value < max(c.log_z for c in state.candidates.values()) + 3.0 for value in left.values())
     assert state.optimism > 400
-
-
-def test_draws_begin_at_the_mode_under_their_noise_and_go_on_from_a_sound_proposal(prepared_line, monkeypatch):
-    state = state_with_nulls(prepared_line)
-    null, (_, evidence) = state.null.found, next(state.null.leading_noises())
-    away, seen = replace(null, z=null.z + 0.3), []
-    whole = posterior.draw_by_importance
-
-    def noted(problem, fits, law, *, sizes, **more):
-        seen.extend(fits)
-        return whole(problem, fits, law, sizes=(*sizes[:3], 1.0 * sizes[0]), **more)
-
-    monkeypatch.setattr(posterior, "draw_by_importance", noted)
-    monkeypatch.setattr(posterior._Ridge, "kernels_beside", lambda *_: pytest.fail("other kernels"))
-    draws = posterior.posterior_draws(away, evidence, prepared_line.recording, 500, rng=np.random.default_rng(1))
-    assert np.abs(seen[0].z - null.z).max() < 0.05
-    assert np.abs(draws.mean(axis=0) - null.z).max() < 0.1

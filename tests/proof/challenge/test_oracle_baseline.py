@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from probewise.proof.tables import (
-    oracle_covariate_rate,
     oracle_credible_set_size,
     oracle_name_rate,
     readings_to_separate_alias,
@@ -38,30 +37,11 @@ def test_the_hardest_rival_that_is_wrong_counts():
     assert oracle_name_rate(lag(8.0, backlash=0.99, halo=0.9, glint=0.6)) == hard < 1
 
 
-def test_a_rival_that_shows_in_the_same_is_no_other_place():
-    shown = {"shows_in": ["slope", "direction"]}
-    assert oracle_covariate_rate({**lag(8.0, backlash=1.0), **shown}) == 1.0
-    # A rival in another covariate that leaves the same trace is taken for it every other time.
-    assert oracle_covariate_rate({**lag(8.0, nonlinearity=1.0), **shown}) == 0.5
-    assert 0.9 < oracle_covariate_rate({**lag(8.0, nonlinearity=0.9), **shown}) < 1.0
-
-
 def test_the_set_holds_one_where_nothing_is_alike_and_aliases_count_once():
     assert oracle_credible_set_size(lag(8.0)) == 1.0
     assert oracle_credible_set_size(lag(8.0, backlash=1.0)) == 1.0
     assert 1.0 < oracle_credible_set_size(lag(8.0, halo=0.92)) < 2.0
     assert oracle_credible_set_size(lag(8.0, halo=0.5)) == pytest.approx(1.0, abs=0.01)
-
-
-def test_two_names_three_nats_apart_are_held_together_as_often_as_the_normal_law_says():
-    """The rival is outside the set where the log odds of the truth, normal about d^2/2 with sd d, pass ln 19."""
-    size, rho = 8.0, 0.95
-    d = size * math.sqrt(1 - rho**2)
-    rng = np.random.default_rng(4)
-    log_odds = d**2 / 2 + d * rng.standard_normal(400_000)
-    alone = np.abs(log_odds) > math.log(19)
-    like = {**lag(size, halo=rho)}
-    assert oracle_credible_set_size(like) == pytest.approx(2 - alone.mean(), abs=0.06)
 
 
 def test_no_number_of_repeated_plans_parts_two_that_agree():

@@ -6,7 +6,7 @@ import pytest
 from probewise.arm import Pose
 from probewise.experiment import CLEAN
 from probewise.experiment.rivals import rivals_of
-from probewise.proof.concealed_study import CONCEALED, ConcealedTrial, _arm_in_concealed_world, concealed_rows
+from probewise.proof.concealed_study import CONCEALED, ConcealedTrial, _arm_in_concealed_world
 from probewise.proof.study import BRIGHT, DARK, FIELD, REFERENCE, experiment_of, footprint_pixels
 from probewise.recordings import Disc, Plan
 from probewise.world import World
@@ -66,18 +66,3 @@ def test_a_scale_of_x_that_is_named_is_compared_as_it_was_put_right():
         (true, CLEAN, true / [1.05, 1, 1]),
     ):
         np.testing.assert_allclose(trial.circle_found_as(name, mean), right)
-
-
-def test_forms_are_summed_up_by_form():
-    run = {"known": True, "readings": 9, "error_mm": 1.0, "held": [True] * 3, "noticed": True, "cpu_s": [0.1, 0.2]}
-    results = {
-        ConcealedTrial(name, 1, 0, 0.9): {**run, "credible": ["backlash"]}
-        for name in ("", "backlash", "play_of_axes", "halo", "ghost", "bent_rail")
-    }
-    forms = {row.concealed: row for row in concealed_rows(results, by_form=True)}
-    assert {name: (row.runs, row.in_credible_set.n) for name, row in forms.items()} == {
-        "in the list": (3, 3),
-        "another form": (1, 1),
-        "in no list": (1, 0),
-    }
-    assert forms["in the list"].in_credible_set.value == pytest.approx(2 / 3)

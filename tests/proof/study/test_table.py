@@ -46,14 +46,6 @@ def test_runs_that_are_sure_and_wrong_are_held_against_what_their_posteriors_exp
     assert poisson.sf(found.wrong_limit, 1.0) <= 0.01 < poisson.sf(found.wrong_limit - 1, 1.0)
 
 
-def test_no_interval_of_the_median_is_given_from_runs_too_few_for_95_percent():
-    """The least and the greatest of n miss the median when all lie on one side: 2 / 2^n, 6 % of 5 and 3 % of 6."""
-    for n in range(2, 9):
-        found = summarise([trial(8 + k) for k in range(n)], max_readings=100).median
-        assert math.isfinite(found.low) == math.isfinite(found.high) == (2 / 2**n <= 0.05)
-        assert found.value == np.median(8 + np.arange(n))
-
-
 def test_the_medians_interval_holds_it_as_often_as_it_says():
     """Distribution-free, so any skewed one will do: at least 95 of 100, over 400 tables of 41 runs."""
     rng = np.random.default_rng(4)

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy.optimize import curve_fit
 
 from probewise.proof.challenge import _right_model_and_readings
 from probewise.proof.refits import SystemRefit, nats_of_alternative, rivals_with_nats, run_table
@@ -61,18 +60,6 @@ def test_what_a_linear_model_leaves_is_as_large_as_asked(name, wanted):
     left = with_effect - basis @ np.linalg.lstsq(basis, with_effect, rcond=None)[0]
     assert np.linalg.norm(left) / drawn.kind.sd == pytest.approx(wanted, rel=0.01)
     assert effect.size_lambda == pytest.approx(wanted, rel=0.01)
-
-
-def test_what_a_bent_model_leaves_is_as_large_as_asked():
-    drawn = _drawn("photodiode against distance")
-    effect = _concealed(drawn, "sensitivity:board_c", 12.0)
-    d, y = drawn.diagnosed_table.columns["dist_mm"], drawn.simulate_diagnosed_rows([effect])
-
-    def law(d, dark, power, behind):
-        return dark + 1e5 * power / (d + behind) ** 2
-
-    found, _ = curve_fit(law, d, y, [0.0, 3.0, 14.0], xtol=1e-12, ftol=1e-12)
-    assert np.linalg.norm(y - law(d, *found)) / drawn.kind.sd == pytest.approx(12.0, rel=0.01)
 
 
 def test_an_offset_that_depends_on_a_column_is_a_sensitivity_by_another_name():

@@ -398,14 +398,6 @@ def test_rows_are_predicted_alone_only_where_neither_the_simulator_nor_an_effect
     assert adding_up.part_that_predicts(rows, TABLE, ())[0] is TABLE
 
 
-def test_a_share_of_the_reading_fades_from_the_start_of_each_run():
-    form = _proposed("s the t_s since the start of the run")
-    y = np.linspace(1.0, 3.0, N_ROWS)[None, :]
-    since = np.concatenate([_T[rows] - _T[rows][0] for rows in (slice(0, N_ROWS // 2), slice(N_ROWS // 2, N_ROWS))])
-    found = form.apply(y, np.array([[0.2, 1.5]]), TABLE)[0]
-    np.testing.assert_allclose(found, y[0] * (1 + 0.2 * np.exp(-since / 1.5)))
-
-
 def test_what_differs_from_run_to_run_is_told_from_the_median_of_the_runs():
     """Of an offset that a parameter takes up, all runs together are known to 0.7 V, their difference to 0.01 V."""
     rng = np.random.default_rng(3)

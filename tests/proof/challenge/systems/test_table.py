@@ -2,7 +2,7 @@
 
 import pytest
 
-from probewise.proof.pages import _case_cells, challenge_page
+from probewise.proof.pages import challenge_page
 from probewise.proof.tables import gains_on_held_out_runs, score_systems
 from probewise.report.html import draw_or_raise
 
@@ -110,16 +110,6 @@ def test_an_oracle_tells_two_that_are_eight_nats_apart_as_often_as_the_normal_la
     assert found["oracle against the hardest rival, lambda 12"] == pytest.approx(0.97725, abs=1e-5)
     assert found["oracle, so counted, lambda 12"] < 1.2
     assert not [row for row in score_systems([system_single("lag")]) if "oracle" in row.name]
-
-
-def test_a_case_of_which_clean_is_said_is_not_called_right_though_the_right_name_is_first_of_all_names():
-    doubted = system_single(said=[], hypotheses=[[[], 0.6], [["offset_drift"], 0.4]])
-    beside_noise = system_single(said=["offset_drift", "random_walk"])
-    assert {row.name: row.found.value for row in score_systems([doubted])}[FIRST] == 1.0
-    assert [_case_cells(0, r)[4:7] for r in (doubted, beside_noise)] == [
-        ("clean", "0.60", "no"),
-        ("offset_drift and random_walk", "0.97", "yes"),
-    ]
 
 
 def test_the_page_tells_every_case():

@@ -16,7 +16,7 @@ from probewise.arm.nxt import (
     normalized_from_counts,
     percent_from_counts,
 )
-from probewise.errors import LinkError, ParameterError
+from probewise.errors import LinkError, LowBatteryWarning, ParameterError
 
 ALL_COAST = bytes.fromhex("04 FF" + 9 * " 00")
 
@@ -87,6 +87,16 @@ def test_a_voltage_that_is_another_every_time_is_told_of(brick, paper_brick):
     paper_brick.carry_out = wild
     with pytest.raises(LinkError, match="another battery voltage each of 6 times"):
         brick.battery_mv()
+
+
+def test_a_battery_below_6_volts_is_warned_of_once(brick, paper_brick):
+    paper_brick.millivolt = 6000
+    assert brick.battery_mv() == 6000
+    paper_brick.millivolt = 5990
+    with pytest.warns(LowBatteryWarning, match=r"the NXT's battery is at 5\.99 V, below 6 V: motors slow down"):
+        assert brick.battery_mv() == 5990
+    paper_brick.millivolt = 5980
+    assert brick.battery_mv() == 5980
 
 
 def test_the_brick_says_who_it_is_and_what_runs_on_it(brick, paper_brick):

@@ -83,6 +83,14 @@ def test_claimed_sds_hold_over_many_arms():
     assert 0.5 < np.mean(height) < 1.6
 
 
+def test_a_mark_that_was_only_seen_gives_its_place():
+    turned, places = touched(built())
+    places[::3, 2] = np.nan
+    found = fit_geometry(GEOMETRY, turned, places)
+    assert np.isnan(found.residuals_mm[0, 2])
+    assert found.geometry.links_mm[0] == pytest.approx(353, abs=2.5)
+
+
 def test_the_mark_that_disagrees_is_named():
     turned, places = touched(built())
     places[3, 0] += 12

@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from probewise.arm import read_geometry, shipped_geometry_path
+from probewise.arm import Joint, read_geometry, shipped_geometry_path
 from probewise.errors import FileError
 
 SHIPPED = read_geometry(shipped_geometry_path())
@@ -93,3 +93,11 @@ def test_the_examples_hold_the_shipped_file():
     if not example.exists():
         pytest.skip("no examples beside an installed package")
     assert example.read_text() == shipped_geometry_path().read_text()
+
+
+@pytest.mark.parametrize(("stop_rad", "side", "counts"), [(1.1, 1, 447), (-1.0, -1, -407)])
+def test_the_count_at_a_stop_has_the_play_on_its_side(stop_rad, side, counts):
+    """7 turns of 180 / pi degrees for a radian: 401.07 counts, and half the play, 0.03 / 2, beyond the stop."""
+    joint = Joint(0, 7.0, 0.0, -1.0, 1.0, 0.03, stop_rad)
+    assert joint.stop_side == side
+    assert joint.stop_counts == counts

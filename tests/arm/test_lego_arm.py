@@ -255,6 +255,14 @@ def test_the_guard_lets_a_joint_that_is_outside_come_back():
         limits.require_allowed_move(0, outside, outside - 1)
 
 
+def test_the_seconds_that_a_reading_takes_grow_with_the_way(bench):
+    places = np.array([[300.0, 200.0], [320.0, 200.0], [900.0, 200.0], [-900.0, 0.0]])
+    seconds = bench.arm.travel_s(Pose(300.0, 200.0), places)
+    assert seconds.shape == (4,)
+    assert seconds[0] < seconds[1] < seconds[2]
+    assert np.isnan(seconds[3])
+
+
 def test_a_simulated_arm_takes_the_geometry_of_a_real_one():
     """Same reach, same orientation: a run on either asks for the same places."""
     arm = SimulatedArm(lambda pose, time_s, height_mm: 50.0, reach=SHIPPED)

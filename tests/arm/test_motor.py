@@ -40,6 +40,16 @@ def test_the_target_is_found_where_the_motor_stands(motor, paper_brick):
     assert abs(motor.move_to(90, 1) - 90) <= 1
 
 
+def test_the_coast_is_learned_whatever_it_is(motor, paper_brick):
+    """A motor that runs on twice as far as first thought: once learned, two moves do."""
+    paper_brick.motors[0].coast = 1.0
+    for goal in (500, 1500, 700, 1800):
+        motor.move_to(goal, 1)
+    before = len(paper_brick.drives())
+    motor.move_to(3500, 1)
+    assert len(paper_brick.drives()) - before == 2
+
+
 @pytest.mark.parametrize("lost", ["command", "answer"])
 def test_a_move_whose_answer_does_not_come_is_never_made_twice(motor, paper_brick, lost):
     """Whether the command or its answer was lost, the motor comes to its goal, and never beyond it."""

@@ -45,6 +45,15 @@ def entered(own, **options):
     return OwnInstrument(lambda: own, clock=Clock(), **options).__enter__()
 
 
+def test_what_is_known_of_a_reading_takes_the_place_of_what_was_asked_for_and_the_rest_is_kept_as_covariates():
+    known = {"x_mm": 1.25, "orientation_rad": 0.1, "time_s": 7, "temperature_c": np.float64(21.5), "lux": math.nan}
+    reading = entered(Own({"value": 3, **known})).measure(Pose(1.0, 2.0, height_mm=9.0))
+    assert reading.pose == Pose(1.25, 2.0, 0.1, 9.0)
+    assert reading.time_s == 7.0
+    assert reading.covariates["temperature_c"] == 21.5
+    assert math.isnan(reading.covariates["lux"])
+
+
 BAD = {
     "nothing": (None, "what measure returned is None; allowed: a finite number, or a dict"),
     "a text": ("41", "what measure returned is '41'; allowed: a finite number"),

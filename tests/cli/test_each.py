@@ -12,6 +12,7 @@ import pytest
 from probewise.cli import main
 from probewise.cli._executor import worker_pool
 from probewise.errors import NotConvergedError
+from probewise.report import each
 
 LINE = (
     "reading, unit = 'y', 'V'\nparameters = {'slope': (-5, 5), 'offset': (-5, 5)}\nvectorized = True\n"
@@ -60,6 +61,17 @@ def test_a_folder_that_cannot_be_written_to_is_told_with_what_is_kept(tmp_path, 
     assert main(["diagnose", *files, *words]) == 2
     assert "in the way; allowed: another folder, or none there; " in (said := capsys.readouterr().err)
     assert "go on with: probewise diagnose" in said
+
+
+def test_rows_are_sorted_by_what_ails_most_devices():
+    rows = [
+        each.DeviceRow("clean one", "clean"),
+        each.DeviceRow("lagging", "named", "lag", 9.0, 0.9, 0.001, "it lags"),
+        each.DeviceRow("worse", "named", "drag:v", 20.0),
+        each.DeviceRow("bad", "named", "drag:v", 12.0),
+    ]
+    assert [row.device for row in each.in_order(rows)] == ["worse", "bad", "lagging", "clean one"]
+    assert each.columns_of(rows)["probability"] == ["", "", "0.9", ""]
 
 
 def test_names_that_cannot_name_a_folder_and_one_with_other_results_are_refused(tmp_path, capsys):

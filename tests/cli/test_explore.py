@@ -11,9 +11,10 @@ import pytest
 
 from probewise.calibration import read_sensor, write_sensor
 from probewise.cli import main, parser
-from probewise.cli.explore import Search
+from probewise.cli.explore import Search, parse_truth
 from probewise.recordings import Instrumentation
 from probewise.report import exploration
+from probewise.scene import Field
 
 
 @pytest.fixture
@@ -180,3 +181,10 @@ def test_without_a_sensor_a_simulated_run_takes_that_of_the_recording_that_ships
     assert main([*given, "3", "--resume"]) == 0
     assert "going through the journal, 0 of 2" in capsys.readouterr().err.splitlines()[0]
     assert json.loads((out / "result.json").read_text())["readings"] == 3
+
+
+@pytest.mark.parametrize("truth", ["0,0,20", "1048,520,150", "ellipse:500,250,90,90,0", "hexagon:500,250,30,0"])
+def test_a_truth_on_its_bounds_is_taken(truth):
+    hidden = parse_truth(truth, ["circle"], Field(), rng=np.random.default_rng(0))
+    assert hidden.name == (truth.partition(":")[0] if ":" in truth else "circle")
+    assert hidden.theta.tolist() == [float(cell) for cell in truth.rpartition(":")[2].split(",")]

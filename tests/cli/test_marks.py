@@ -119,3 +119,11 @@ def test_a_scan_that_starts_over_the_wrong_side_is_told_of_at_the_first_reading_
     first = next(k for k, text in enumerate(said) if text)
     assert first == 65  # the first that is all white, and dark
     assert "at (15, 0) mm it is white, and reads 14, where black read 58" in said[first]
+
+
+def test_a_right_scan_is_not_told_of():
+    plan = edge()
+    noise = np.random.default_rng(3).normal(0.0, 1.5, len(plan))
+    watch = SheetCheck(plan, white_is_bright=True)
+    levels = 14 + 44 / (1 + np.exp(-plan.x_mm / 3))
+    assert not any(watch.complaint_about_reading(row, float(value)) for row, value in enumerate(levels + noise))

@@ -8,6 +8,7 @@ import numpy as np
 
 from probewise.diagnosis.light_sensor import (
     LightSensorApparatus,
+    candidate_scans,
     rows_of_distinct_scans,
     varying_covariates,
 )
@@ -51,3 +52,18 @@ def test_a_scan_that_returns_after_a_whole_turn_is_the_same_scan_at_the_same_ori
 
     kinds = orientations(plan)
     assert len(set(zip(kinds, orientations(turned), strict=True))) == kinds.max() + 1
+
+
+def test_a_scan_is_raised_from_the_height_at_which_it_was_taken():
+    plan = two_way_plan()
+    plan = replace(plan, instrumentation=replace(plan.instrumentation, controls=("height_mm",), height_mm=16.0))
+    second, third = rows_of_distinct_scans(plan)[1:3]
+    heights = np.full(len(plan), np.nan)
+    heights[second], heights[third[::2]] = 20.0, 20.0
+    lifted = replace(plan, covariates={**plan.covariates, "height_mm": heights})
+    raised = [scan for scan in candidate_scans(lifted) if scan.kind == "raise"]
+    np.testing.assert_array_equal(raised[0].plan.covariates["height_mm"], 20.0)
+    np.testing.assert_array_equal(raised[1].plan.covariates["height_mm"], 25.0)
+    np.testing.assert_array_equal(np.unique(raised[2].plan.covariates["height_mm"]), [20.0, 25.0])
+    endings = ("with the sensor at 20 mm", "with the sensor at 25 mm", "with the sensor at 1.25 times its height")
+    assert all(scan.description.endswith(words) for scan, words in zip(raised[:3], endings, strict=True))

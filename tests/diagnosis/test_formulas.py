@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from probewise.diagnosis.diagnose_simulator import diagnose_system, prepare_system
 from probewise.diagnosis.diagnosis import diagnose_prepared
+from probewise.diagnosis.search import search
+from probewise.diagnosis.verdict import run_global_test
 from probewise.systems import RunTable, Simulator, table_for
 
 SD = 0.05
@@ -88,3 +92,18 @@ def test_a_product_beside_both_of_its_columns_is_what_remains():
     assert remainder.formula is not None
     low, high = remainder.formula.parameters[0].interval95
     assert low < 0.001 < high
+
+
+def test_a_formula_that_the_readings_proposed_is_no_test_of_them():
+    """A p-value that counts the best of hundreds of formulas, chosen by these readings, is too small."""
+    rng = np.random.default_rng(4)
+    x = rng.uniform(0.0, 1.0, 60)
+    simulator = Simulator("y", "V", {"a": (-5, 5)}, simulate=lambda p, u: p["a"] + 2.0 * u["x"])
+    table = table_for(simulator, {"x": x, "y": 1.0 + 2.0 * x + 0.4 * SD * np.cos(9 * x) + SD * rng.normal(size=60)})
+    prepared = prepare_system(simulator, table)
+    searched = search(prepared, depth=0)
+    formulas = prepared.apparatus.proposed_formulas()
+    assert len(formulas) > 5
+    more = replace(searched, prepared=replace(prepared, effects={**prepared.effects, **formulas}))
+    tests = [run_global_test(each, rng=np.random.default_rng(1)) for each in (searched, more)]
+    assert tests[0].p_value == tests[1].p_value

@@ -10,7 +10,7 @@ import pytest
 from scipy.special import ndtri
 
 from probewise.diagnosis import diagnose_system, fit_simulator
-from probewise.diagnosis.diagnose_simulator import prepare_system
+from probewise.diagnosis.diagnose_simulator import prepare_system, recording_from_table
 from probewise.diagnosis.evidence import laplace_evidence
 from probewise.diagnosis.fit import Model, fit
 from probewise.diagnosis.fit_simulator import repaired_of
@@ -59,6 +59,16 @@ def left_out(table: dict[str, np.ndarray]) -> list[int]:
 )
 def test_readings_far_from_all_others_are_left_out_and_a_jump_is_not(table, rows):
     assert left_out(table) == rows
+
+
+def test_first_readings_of_runs_that_are_all_far_off_are_an_effect_and_no_lost_readings():
+    runs = [oven(20, r0=60 + k) for k in range(6)]
+    table = {name: np.concatenate([run[name] for run in runs]) for name in runs[0]}
+    table["run"] = np.repeat([f"run {k}" for k in range(6)], 20)
+    simulator = Simulator(
+        "temp_c", "degC", dict(OVEN.parameters), simulate=OVEN.simulate, time="t_s", run="run", noise={"sd": 0.1}
+    )
+    assert prepare_system(simulator, table_for(simulator, table), with_effects=False).recording.left_out == ()
 
 
 @np.errstate(all="raise")  # which is the caller's, and ends no run
@@ -165,6 +175,14 @@ def test_a_prediction_beyond_an_end_is_limited_unless_a_reading_within_was_recor
     table = RunTable({"d_m": np.array([1.0, 2.0]), "lux": np.array([reading, 300.0])})
     predicted = System.of(lamp, table).chain(table, ()).predict(TRUE_LIMITED[None, :], table)
     np.testing.assert_allclose(predicted, [[expected, BACK + FULL / 4]])
+
+
+def test_a_reading_half_a_step_beyond_an_end_is_at_it_and_a_farther_one_is_an_error_code():
+    lamp = replace(LAMP, noise={"range": (0, HIGH), "step": 1.0})
+    table = RunTable({"d_m": np.arange(1.0, 6.0), "lux": np.array([HIGH, 1000.4, 999.4, 1001.0, 9999.0])})
+    recording = recording_from_table(lamp, table)
+    assert recording.usable.tolist() == [True, True, True, False, False]
+    assert recording.censored.tolist() == [True, True, False, False, False]
 
 
 def test_a_walk_is_no_explanation_of_readings_at_an_end_that_the_simulator_does_not_predict_there():

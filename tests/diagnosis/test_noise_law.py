@@ -4,20 +4,43 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 from scipy.stats import norm
 
 from probewise.diagnosis import diagnose
-from probewise.diagnosis.noise import NoiseLaw, log_prior_of_lost_value
-from probewise.recordings import Recording, two_way_plan
+from probewise.diagnosis.evidence import laplace_evidence
+from probewise.diagnosis.fit import Fit
+from probewise.diagnosis.noise import NoiseLaw, NoiseModel, log_prior_of_lost_value
+from probewise.effects.noise import dropouts, outliers
+from probewise.recordings import Recording, paper_plan, two_way_plan
 from probewise.world.spots import Blob, gaussian_spot
 from probewise.world.world import World
+
+PLAN = paper_plan()
+
+
+N = len(PLAN)
+
+
+SD = 0.6
+
+
+MEAN = 35.0 + 25.0 * np.tanh(PLAN.x_mm / 8)
 
 
 def heavy(share: float, times: float, n: int = 50) -> NoiseLaw:
     return NoiseLaw(np.ones(n), np.zeros(n), np.zeros(n, dtype=np.bool_), share, times)
+
+
+def found_with(noise: np.ndarray, slope: np.ndarray | None = None) -> tuple[Fit, Recording]:
+    """Make a fit of one parameter at its prior's centre."""
+    slopes = np.zeros((N, 1)) if slope is None else slope[:, None]
+    model = cast(Any, SimpleNamespace(sensor=SimpleNamespace(has_exchangeable_gaussians=False)))
+    return Fit(model, np.zeros(1), MEAN, noise, slopes, SD, 0.0), Recording(PLAN, MEAN + noise)
 
 
 def log_mixture(z: np.ndarray, share: float, times: float) -> np.ndarray:
@@ -44,6 +67,22 @@ def test_the_scale_of_heavy_tailed_noise_is_at_the_peak_of_its_likelihood(share,
         assert (law.minus_log_likelihood(z, factor * sigma) > best).all()
         again = law.whitened_density.likeliest_sigma(z, 50, start=factor * sigma)
         np.testing.assert_allclose(again, sigma, rtol=0.0025)
+
+
+def test_readings_lost_to_one_value_are_no_wide_ones():
+    rng = np.random.default_rng(5)
+    noise = SD * rng.normal(size=N)
+    lost = np.array([30, 90, 200, 310])
+    noise[lost] = -MEAN[lost]
+    found, recording = found_with(noise)
+    log_z = {
+        e.name: laplace_evidence(found, NoiseModel((e,), recording, least_sd=1e-6)).log_z
+        for e in (dropouts(), outliers())
+    }
+    plain = laplace_evidence(found, NoiseModel((), recording, least_sd=1e-6)).log_z
+    assert log_z["dropouts"] > log_z["outliers"] + 3 > plain + 50
+    law = laplace_evidence(found, NoiseModel((dropouts(),), recording, least_sd=1e-6)).likeliest_law
+    np.testing.assert_array_equal(np.flatnonzero(law.lost), lost)
 
 
 def test_the_prior_of_what_is_lost_to_sums_to_one():

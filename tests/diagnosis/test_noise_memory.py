@@ -15,6 +15,7 @@ from probewise.diagnosis.evidence import predictive_log_densities
 from probewise.diagnosis.noise import (
     NoiseLaw,
     innovations_given_rest,
+    walk_given_readings,
     with_known_wide_readings,
 )
 
@@ -79,6 +80,16 @@ def test_readings_left_out_of_a_chain_hand_their_correlation_on():
         r = np.random.default_rng(4).normal(size=kept.sum())
         assert np.sum(taken(r) ** 2) == pytest.approx(r @ np.linalg.solve(own, r))
         assert taken.half_log_det() == pytest.approx(0.5 * np.linalg.slogdet(own)[1])
+
+
+def test_the_smoothed_walk_is_its_conditional_mean():
+    law, covariance = _laws()["walk"]
+    seen = ~law.lost
+    residuals = np.random.default_rng(5).normal(size=_N)
+    of_walk = covariance - np.diag(law.sd**2)
+    expected = of_walk[:, seen] @ np.linalg.solve(covariance[np.ix_(seen, seen)], residuals[seen])
+    np.testing.assert_allclose(walk_given_readings(law, residuals), expected)
+    assert not walk_given_readings(_laws()["ar"][0], residuals).any()
 
 
 N = 9

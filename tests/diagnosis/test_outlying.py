@@ -12,7 +12,7 @@ from probewise.diagnosis.evidence import held_out_gain
 from probewise.diagnosis.fit import Model, fit
 from probewise.diagnosis.locate import Covariate, window_columns
 from probewise.diagnosis.noise import NoiseLaw, white_noise
-from probewise.diagnosis.outlying import clustering_log_bayes_factors
+from probewise.diagnosis.outlying import clustering_log_bayes_factors, outlier_probabilities
 from probewise.recordings import Recording, paper_plan
 from probewise.systems import Simulator, table_for
 from probewise.world.spots import Blob, gaussian_spot
@@ -51,6 +51,10 @@ N_OF_OUTLYING = 120
 PLACE = Covariate("place", np.linspace(-50, 50, N_OF_OUTLYING), np.arange(N_OF_OUTLYING))
 
 
+def tailed(n: int = N_OF_OUTLYING) -> NoiseLaw:
+    return NoiseLaw(np.ones(n), np.zeros(n), np.zeros(n, dtype=bool), share=0.05, times=6.0)
+
+
 def test_the_evidence_is_that_of_two_beta_binomials_against_one():
     """Of given numbers in and out of a window, the order within each being even."""
     far_out = np.zeros(N_OF_OUTLYING)
@@ -69,6 +73,18 @@ def test_the_evidence_is_that_of_two_beta_binomials_against_one():
 
 def _choose(n: int, k: int) -> float:
     return float(np.prod([(n - i) / (k - i) for i in range(k)])) if k else 1.0
+
+
+def test_what_is_in_the_tail_follows_bayes_rule():
+    law = tailed()
+    residuals = np.random.default_rng(2).standard_normal(N_OF_OUTLYING)
+    residuals[10] = 9.0
+    sigma = float(law.likeliest_sigma(law(residuals)[:, None])[0])
+    odds = (0.05 / 6) * np.exp(-0.5 * (residuals / sigma / 6) ** 2) / (0.95 * np.exp(-0.5 * (residuals / sigma) ** 2))
+    np.testing.assert_allclose(outlier_probabilities(residuals, law), odds / (1 + odds))
+    assert outlier_probabilities(residuals, law)[10] > 0.999
+    residuals[10] = 1e6  # where both densities are nothing
+    assert outlier_probabilities(residuals, law)[10] == 1.0
 
 
 def spotted(rows: np.ndarray) -> Recording:

@@ -16,7 +16,7 @@ from probewise.diagnosis.evidence import LEAST_VISIBLE, SCALES, Linearised
 from probewise.diagnosis.fit import Fit, Model, effect_coordinates, effect_values
 from probewise.diagnosis.light_sensor import LightSensorApparatus, rows_as_next_scan
 from probewise.diagnosis.locate import Covariate, places_of_effect
-from probewise.diagnosis.noise import NoiseLaw, white_noise
+from probewise.diagnosis.noise import NoiseLaw, noise_statistics, white_noise
 from probewise.diagnosis.prepared import join, join_plans
 from probewise.diagnosis.search.hypotheses import Refits
 from probewise.diagnosis.sensors import default_sensor, sensor_from_samples, theta_to_natural, with_free_form
@@ -236,6 +236,21 @@ def test_an_effect_is_where_it_has_half_its_strength():
     assert found.end == pytest.approx(10 + half, abs=1)
 
 
+def test_what_sets_in_at_a_level_is_at_what_would_be_read_without_it():
+    """Readings from 10 to 60 that never rise above 50: a model without a ceiling, fitted to them, tops at some 52."""
+    without = np.linspace(10.0, 60.0, 101)
+    change = np.minimum(without, 50.0) - without
+    level = Covariate("level", np.minimum(without, 52.0), np.arange(101))
+    effect = VOCABULARY["saturation"].for_extent(EXTENT)
+    plan = line(101, scans=1).plan
+    (found,) = placed(effect, change, without, plan, [level])
+    assert found.covariate == "level"
+    assert found.without_effect
+    np.testing.assert_array_equal(found.values, without)
+    assert found.start == pytest.approx(50.5, abs=0.6)
+    assert found.end == pytest.approx(60.0, abs=1e-9)
+
+
 def test_an_effect_of_one_mounting_is_in_the_scans_that_feel_it_the_strongest_first():
     """A scan over white looks the same from any angle: nothing shows there, though its mounting is turned too."""
     plan = line(6, scans=3).plan
@@ -245,6 +260,20 @@ def test_an_effect_of_one_mounting_is_in_the_scans_that_feel_it_the_strongest_fi
     change = np.repeat([0.5, 0.001, -2.0], 6)
     found = placed(effect, change, 0 * change, plan, [scan])
     assert [place.scan for place in found] == ["s2", "s0"]
+
+
+def test_noise_statistics_see_memory_tails_and_level():
+    rng = np.random.default_rng(0)
+    n = 2000
+    level = np.linspace(0, 1, n)
+    plain = rng.normal(size=n)
+    memory = np.convolve(plain, [1, 0.5], mode="same")
+    tails = rng.standard_t(3, size=n)
+    louder = plain * (1 + 3 * level)
+    lag, kurtosis, tilt = noise_statistics(np.stack([plain, memory, tails, louder], axis=1), np.arange(n) - 1, level)
+    assert abs(lag[0]) < 0.1 < lag[1]
+    assert abs(kurtosis[0]) < 0.5 < kurtosis[2]
+    assert abs(tilt[0]) < 5 < tilt[3]
 
 
 def test_joined_recordings_keep_scans_and_patterns_apart():

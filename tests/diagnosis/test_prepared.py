@@ -56,6 +56,13 @@ def test_readings_too_far_out_for_noise_are_left_out_and_scale_nothing(lost, ste
     assert known is None or known[1] in lost.values()
 
 
+def test_too_little_is_few_readings_or_equal_ones():
+    whole = recording()
+    assert not prepare(whole, apparatus=SENSOR).has_too_little_data
+    assert prepare(recording(20), apparatus=SENSOR).has_too_little_data
+    assert prepare(replace(whole, readings=np.full(408, 5.0)), apparatus=SENSOR).has_too_little_data
+
+
 def test_a_sensor_of_another_height_reads_the_plan_at_the_height_it_declares():
     """As readings of the calibration's height that command it; the plan itself stays as it was declared."""
     theta = np.array([1.0, 0.5, 1.5, 0.03, 0.08, -0.005, 11.0, 58.0])

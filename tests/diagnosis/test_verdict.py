@@ -115,6 +115,16 @@ def test_a_credible_set_is_the_fewest_that_hold_the_mass():
     assert Judged("named", ("backlash",), 0.0, found).credible == ("backlash", "backlash+lag")
 
 
+def test_the_leader_is_the_effect_on_the_mean_with_the_most_probability_over_all_noises():
+    """An alias of a hundredth does not tip the class over one half, either."""
+    split = {(("lag",), ()): 0.33, (("lag",), ("outliers",)): 0.27, (("drift",), ()): 0.4}
+    assert verdict(split) == ("named", ("lag",))
+    pair = Alias(("drift", "lag"), 0.95, "repeat", 26)
+    split = {(("lag",), ()): 0.49, (("lag",), ("outliers",)): 0.42, (("drift",), ()): 0.02, ((), ()): 0.07}
+    assert verdict(split, aliases=(pair,), same=[("drift",)]) == ("named", ("lag",))
+    assert verdict({((), ("outliers",)): 0.6, (("lag",), ()): 0.4}) == ("noise", ("outliers",))
+
+
 def by_what_is_shared(verdict, combination, probabilities, *, p_value=1e-6, aliases=()):
     hypotheses = tuple(Hypothesis(names, p) for names, p in probabilities.items())
     judged = with_shared_effects(Judged(verdict, combination, p_value, hypotheses, aliases=aliases), NOISE)
@@ -136,6 +146,12 @@ def test_an_effect_with_a_credible_alias_is_not_shared():
     joint = {("drift", "lag"): 0.8, ("lag",): 0.1, ("drift",): 0.1}  # each is in nine tenths, both in eight
     assert by_what_is_shared("cannot_tell", ("drift", "lag"), joint)[1] == ("drift", "lag")
     assert len(shared_effects(joint)) == 1
+
+
+def test_a_shared_fault_of_the_noise_names_no_physics():
+    probabilities = {("lag", "outliers"): 0.4, ("drift", "outliers"): 0.4, ("outliers",): 0.2}
+    judged = by_what_is_shared("cannot_tell", ("lag", "outliers"), probabilities)
+    assert judged[:2] == ("cannot_tell", ("lag", "outliers"))
 
 
 def test_noise_is_no_verdict_if_most_of_the_probability_is_on_the_mean():

@@ -45,6 +45,18 @@ def test_the_arm_stands_where_two_links_over_a_turning_base_lead(geometry):
     assert stand.orientation_rad == pytest.approx(math.radians(sensor["mounting_deg"] - 70 - 90))
 
 
+def test_play_leaves_the_joint_behind_on_the_side_it_came_from(geometry):
+    arm = EmulatedArm(geometry)
+    joint = geometry["joints"]["base"]
+    motor = arm.motors()["ABC".index(joint["port"])]
+    angles = []
+    for way in (1, -1):
+        while way * motor.angle_deg < 70:
+            motor.step(1e-3, 40 * way, brake=False, battery_mv=7400)
+        angles.append(arm.sensor_pose().orientation_rad - math.radians(motor.angle_deg / joint["gear_ratio"]))
+    assert math.degrees(angles[1] - angles[0]) == pytest.approx(joint["play_deg"])
+
+
 def sight(stand, clock, *, albedo=1.0):
     world = replace(WORLD, noise_sd=0.0)
     return LightModel(world, Tabletop(Uniform(albedo)), lambda: stand, read_height_mm=14.0, seed=3, clock=clock)
@@ -56,6 +68,17 @@ def sight(stand, clock, *, albedo=1.0):
 )
 def test_what_the_brick_shows_with_the_led_and_with_the_rooms_half_alone(clock, height_mm, albedo, lit, shown):
     assert sight(SensorPose(0, 0, height_mm, 0), clock, albedo=albedo)(lit) == pytest.approx(shown)
+
+
+def test_the_first_reading_at_the_nth_stand_has_the_nth_noise(clock):
+    """As on the simulated arm with the same seed, however often it is read at one stand."""
+    at = [SensorPose(0, 0, 14.0, 0)]
+    look = LightModel(WORLD, Tabletop(Uniform(1.0)), lambda: at[0], read_height_mm=14.0, seed=7, clock=clock)
+    for number in range(4):
+        at[0] = SensorPose(10.0 * number, 0, 14.0, 0)
+        expected = 60.5 + 0.6 * np.random.default_rng([7, number]).standard_normal()
+        assert look(True) == pytest.approx(expected)
+        assert look(True) != pytest.approx(expected)
 
 
 def test_a_person_turns_the_sensor_and_changes_what_lies_there(clock):

@@ -65,6 +65,32 @@ def test_a_limited_run_overshoots_as_published_and_shows_idle_before_it_rests(as
     assert 400 <= port.tacho_count <= 440
 
 
+def test_hold_brings_a_pushed_motor_back_and_coasting_does_not(ask, clock, brick):
+    ask(f"80 04 00 {HOLD}")
+    port = wait(clock, brick, 0.5)
+    port.motor.angle_deg += 20
+    port.motor.speed_deg_s = 1.0
+    assert abs(wait(clock, brick, 2.0).tacho_count) <= 3
+    ask(f"80 04 00 00 {COAST} 00 00 00 00")
+    port.motor.angle_deg += 20
+    assert wait(clock, brick, 2.0).tacho_count >= 17
+
+
+def test_overshoot_is_taken_off_the_next_run_in_the_same_direction(ask, clock, brick):
+    """The goal runs on from where the last run should have ended."""
+    for _ in range(2):
+        turn(ask, 75, 360)
+        port = wait(clock, brick, 2.0)
+    assert 720 + 40 <= port.tacho_count <= 720 + 80
+
+
+def test_a_motor_stands_still_at_its_stop():
+    motor = Motor(stops_deg=(-50.0, 100.0))
+    for _ in range(1000):
+        motor.step(1e-3, 80, brake=False, battery_mv=7400)
+    assert (motor.angle_deg, motor.speed_deg_s) == (100.0, 0.0)
+
+
 def test_the_brick_sleeps_unless_it_is_kept_awake(ask, clock, brick):
     """Only KEEPALIVE counts; asleep, it answers nothing and its motors coast."""
     clock.sleep(599.0)

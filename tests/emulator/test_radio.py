@@ -57,6 +57,15 @@ def test_a_fault_befalls_its_share_of_replies_and_changes_nothing_else(clock, fa
     assert likely(sum(befallen(answer, seconds) for answer, seconds in got), N, rate)
 
 
+def test_a_corrupted_reply_has_one_other_byte(clock):
+    """Anywhere in the frame, its length included."""
+    got = answers(clock, Faults(corrupt=0.2, late_s=0.0))
+    other = [[k for k, (a, b) in enumerate(zip(answer, ANSWER, strict=True)) if a != b] for answer, _ in got]
+    assert {len(places) for places in other} == {0, 1}
+    assert likely(sum(map(len, other)), N, 0.2)
+    assert {places[0] for places in other if places} == set(range(len(ANSWER)))
+
+
 def test_half_a_telegram_is_the_beginning_of_a_request_or_of_a_reply(clock):
     """A brick that got half a request waits 0.61 s for the rest: who asks later than that is heard."""
     faults = Faults(half=0.2, late_s=1.0)

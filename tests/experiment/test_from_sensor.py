@@ -3,7 +3,10 @@
 import numpy as np
 import pytest
 from exploring import ChainArm, run
+from hand_made import NAMES, sensor_of
 
+from probewise.effects import Origin
+from probewise.experiment import experiment_for
 from probewise.experiment.from_sensor import AdjustedMixture, sensor_change_prior
 from probewise.inference import GaussianKnown
 from probewise.scene import Circle, Field, HypothesisScene
@@ -54,3 +57,15 @@ def test_a_footprint_taken_for_a_half_too_wide_is_put_right(small):
     size, error = found.last.sensor["log_size_u"]
     assert abs(size - np.log(1 / 1.5)) < 5 * error
     assert "log_size_u" in found.summary()
+
+
+def test_effects_of_a_sensor_from_far_away_count_from_0_in_a_run():
+    sensor = sensor_of(
+        np.tile([1.0, 0.5, 1.5, 0.03, 0.08, -0.005, 11.0, 58.0, 0.2, 30.0], (500, 1)),
+        names=(*NAMES, "gain_drift.frac", "gain_drift.tau_s"),
+        effects=("gain_drift",),
+        origins={"gain_drift": Origin(time_s=1.7e9)},
+    )
+    (kept,) = sensor.effects_on_new_scans
+    (of_run,) = experiment_for(sensor, Circle(), Field(), trust=1.0).model.effects
+    assert (kept.binding.where.origin, of_run.effect.binding.where.origin) == (Origin(time_s=1.7e9), Origin())

@@ -86,6 +86,21 @@ def test_effects_of_the_height_change_that_of_the_calibration(method, arm_mm, cl
     np.testing.assert_allclose(experiment.forecast.predict(TRUTH[None], designs)[0], read, atol=0.5)
 
 
+def test_a_slope_among_the_rivals_is_one_hundredth_of_the_calibrated_height(close_sensor):
+    plain = replace(close_sensor, names=NAMES, samples=SAMPLES, effects=())
+    for sensor, height_mm in ((plain, LOW_MM), (replace(plain, instrumentation=Instrumentation()), 14.0)):
+        experiment = experiment_for(sensor, CIRCLE, FIELD, trust=0.9)
+        (slope,) = [kind.effect for kind in experiment.kinds if kind.left_out == "height_gradient"]
+        assert slope.entries[0, 0, 0] == pytest.approx(0.01 * height_mm / np.hypot(300.0, 200.0))
+
+
+def test_a_journal_names_the_height_only_beside_others_to_choose(small, close_sensor):
+    """Journals of earlier versions did so, and go on."""
+    seed = np.random.SeedSequence(1)
+    assert experiment_for(close_sensor, CIRCLE, FIELD).settings(seed)["options"]["calibrated_height_mm"] is None
+    assert asked(small).settings(seed)["options"]["calibrated_height_mm"] == 14.0
+
+
 class OwnArm:
     """Reads a disc from 20 mm; `tells` is what it says of that beside the reading, `more` what it declares."""
 

@@ -47,6 +47,14 @@ def test_a_journal_reads_back_every_bit_of_what_was_written(tmp_path):
     assert journal.notes == ()
 
 
+def test_a_journal_is_one_json_object_a_line(tmp_path):
+    write(tmp_path / "j", 2)
+    lines = [json.loads(line) for line in (tmp_path / "j").read_text().splitlines()]
+    assert len(lines) == 3
+    assert set(lines[1]) == {"index", "pose", "time_s", "reading", "covariates", "belief"}
+    assert set(lines[1]["belief"]) == {"mean", "sd", "bits", "next"}
+
+
 def test_whatever_byte_the_writer_is_killed_at_a_run_goes_on_behind_the_last_whole_reading(tmp_path):
     """Cut at every byte of the last line: a reading that is there is never taken out again, not even for a moment."""
     path = tmp_path / "journal.jsonl"
@@ -111,6 +119,14 @@ def test_a_new_journal_never_overwrites_a_file(tmp_path):
     assert (tmp_path / "j").read_text() == "precious"
 
 
+def test_every_setting_that_differs_is_named(tmp_path):
+    write(tmp_path / "j", 1)
+    journal = read_journal(tmp_path / "j")
+    require_same_settings(journal, SETTINGS)
+    with pytest.raises(FileError, match=r"seed '7' there, '8' here; shape 'Circle\(\)' there, 'Square\(\)' here"):
+        require_same_settings(journal, {**SETTINGS, "seed": "8", "shape": "Square()"})
+
+
 def test_a_journal_becomes_a_recording_over_the_field(tmp_path):
     write(tmp_path / "j", 3)
     disc, lego = Disc((1.0, 2.0), 30.0), Instrumentation(min=1, max=100, step=1)
@@ -121,6 +137,11 @@ def test_a_journal_becomes_a_recording_over_the_field(tmp_path):
     np.testing.assert_array_equal(recording.plan.covariates["battery_mv"], [7901.0, 7902.0, 7903.0])
     assert recording.plan.rows_by_pattern()[0][0] == "field"
     assert recording.plan.patterns["field"] == disc
+
+
+def test_a_covariate_that_one_reading_lacks_is_nan_there():
+    recording = recording_of([reading(1), Reading(5.0, Pose(0.0, 0.0), 1.0)])
+    assert np.isnan(recording.plan.covariates["battery_mv"]).tolist() == [False, True]
 
 
 def test_the_height_that_was_commanded_is_a_covariate_unless_the_reading_has_its_own():
@@ -182,6 +203,21 @@ def test_a_journal_whose_digest_is_of_the_classes_of_effects_goes_on_with_the_sa
         require_same_settings(read_journal(tmp_path / "j"), {**kept, "sensor": sensor, "sensor_sha256": "c" * 64})
     with pytest.raises(FileError, match="another sensor model, or other cards;"):
         require_same_settings(read_journal(tmp_path / "j"), {**kept, "sensor": "c" * 64})
+
+
+def test_a_run_over_another_hidden_shape_does_not_go_on_from_a_journal(small, tmp_path):
+    """The readings that it holds are of what lay there, whatever the caller believes now."""
+    path = tmp_path / "new" / "folder" / "journal.jsonl"
+    here, there = (HiddenShape("circle", Circle(), np.array([x_mm, 140.0, 60.0])) for x_mm in (250.0, 300.0))
+
+    def go_on(hidden):
+        rng = np.random.default_rng(5)
+        return run(small.arm(), small.experiment(), rng=rng, max_readings=1, journal=path, hidden=hidden)
+
+    assert len(go_on(here).steps) == len(go_on(here).steps) == 1
+    for other, said in ((there, "hidden.x_mm 250.0 there, 300.0 here"), (None, "hidden.x_mm 250.0 there, None here")):
+        with pytest.raises(FileError, match=said):
+            go_on(other)
 
 
 def test_what_a_journal_says_of_its_files_may_differ_when_the_run_goes_on(tmp_path):

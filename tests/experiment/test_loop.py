@@ -348,6 +348,14 @@ def test_a_reading_for_which_the_run_goes_on_is_taken_before_those_planned(small
     assert (info.next_pose, *state.planned) == ((Pose(*place),) if asks else planned)
 
 
+def test_repeats_are_taken_on_the_spot(small):
+    experiment = small.experiment(repeats=(3,), noise_sd=6.0, likelihood=small.gaussian(6.0))
+    result = run(small.arm(), experiment, rng=rng(), max_readings=6)
+    places = [(r.pose.x_mm, r.pose.y_mm) for r in result.readings]
+    assert places[0] == places[1] == places[2] != places[3]
+    assert places[3] == places[4] == places[5]
+
+
 def test_a_run_that_nothing_within_reach_can_advance_stops_and_says_so(small):
     """Four places and a sensor that says yes or no: when all are read, a further reading tells nothing."""
     arm = small.arm(sensor=small.sensor(0.0), reach_mm=30.0)

@@ -7,7 +7,7 @@ import pytest
 
 from probewise.arm import Pose, Reading
 from probewise.experiment.kinds import prior_posterior
-from probewise.experiment.rivals import gain_loss, rivals_of
+from probewise.experiment.rivals import PACED_S_PER_READING, Pace, gain_loss, rivals_of
 from probewise.proof.study import REFERENCE, experiment_of
 
 
@@ -29,6 +29,23 @@ def test_a_fast_instrument_drifts_over_as_many_readings_as_a_slow_one(name):
         theta = effect.prior.from_unit_cube(np.random.default_rng(1).random((20, len(effect.prior.names))))
         value = np.tile(np.linspace(10.0, 60.0, 8), (20, 1))
         np.testing.assert_allclose(effect.apply(value, theta, fast), effect.apply(value, theta, slow), rtol=1e-4)
+
+
+def test_parameters_are_told_by_the_clock():
+    (step,) = rivals("ambient_step")
+    pace = Pace.from_readings(readings(2.0))
+    assert pace.s_per_reading == pytest.approx(2.0)
+    np.testing.assert_allclose(pace.in_seconds(step, np.array([5.0, 4 * PACED_S_PER_READING])), [5.0, 8.0])
+    (drift,) = rivals("offset_drift")
+    np.testing.assert_allclose(pace.in_seconds(drift, np.array([1.0])), [4.0])
+
+
+def test_a_lamp_that_begins_as_calibrated_may_fade():
+    plan = experiment_of(REFERENCE).problem(readings(8.0)).recording.plan
+    faded = gain_loss().apply(np.full((1, 8), 50.0), np.array([[-0.5, 800.0]]), plan)[0]
+    assert faded[0] == 50.0
+    assert (np.diff(faded) < 0).all()
+    np.testing.assert_allclose(faded[-1], 50.0 * (1 - 0.5 * (1 - np.exp(-56.0 / 800.0))))
 
 
 @pytest.mark.parametrize(("tau_s", "told"), [(10.0, "falls by 10 % in the end, 10 % in the"), (6000.0, "0.1 % in the")])

@@ -11,7 +11,7 @@ from hand_made import TRUTH, sensor_of
 
 from probewise.arm import ReadingScale
 from probewise.arm.instrument import Pose, Reading
-from probewise.errors import NotConvergedError, ParameterError
+from probewise.errors import FileError, NotConvergedError, ParameterError
 from probewise.experiment import (
     NestedSampling,
     experiment_for,
@@ -19,7 +19,7 @@ from probewise.experiment import (
     naive_levels_from_recording,
     naive_levels_from_world,
 )
-from probewise.experiment.paper import OneScan
+from probewise.experiment.paper import OneScan, student_t_likelihood
 from probewise.inference import Naive
 from probewise.inquiry import Grid, InformationGain, ReadingEntropy
 from probewise.inquiry.entropy import best_designs_mask
@@ -131,6 +131,14 @@ def same(a, b):
     return (a.reading, a.next_pose, a.bits, a.log_z) == (b.reading, b.next_pose, b.bits, b.log_z) and (
         a.samples == b.samples
     ).all()
+
+
+def test_a_journal_of_one_method_is_not_gone_on_with_by_another(small, tmp_path):
+    journal = tmp_path / "journal.jsonl"
+    run(small.arm(), small.experiment(likelihood=STUDENT, method=QUICK), rng=rng(), max_readings=1, journal=journal)
+    for other in (None, replace(QUICK, stop=EvidenceChange(1e-8))):
+        with pytest.raises(FileError, match="method"):
+            run(small.arm(), small.experiment(likelihood=STUDENT, method=other), rng=rng(), journal=journal)
 
 
 @pytest.mark.slow
@@ -262,6 +270,11 @@ def test_a_simulated_sensor_reads_its_levels_on_its_own_scale():
     assert 0.5 < found.sd_black < 2
     quiet = naive_levels_from_world(replace(world, noise_sd=0.0), ReadingScale(), rng=rng())
     assert (quiet.mu_black, quiet.sd_white) == (10.0, 1 / math.sqrt(12))
+
+
+def test_the_student_ts_sd_lies_between_rounding_and_the_levels():
+    assert student_t_likelihood(FixedLevels(60.0, 10.0), 1.0) == OneScan(1 / math.sqrt(12), 50.0)
+    assert student_t_likelihood(FixedLevels(0.0, 5.0), None) == OneScan(0.005, 5.0)
 
 
 def test_the_loop_of_the_paper_and_the_method_of_explore_infer_the_same(small):

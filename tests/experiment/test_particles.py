@@ -122,6 +122,15 @@ def test_a_reading_that_surprises_is_taken_in_from_scratch(small):
     assert len(found.theta) == 500
 
 
+def test_a_missing_reading_changes_nothing(small):
+    before = particles(small, n_particles=300, steps=3)
+    readings = [Reading(v, Pose(x, y), 0.0) for x, y, v in READINGS[:3]]
+    problem = noisy(small).problem([*readings, Reading(math.nan, Pose(10.0, 10.0), 1.0)])
+    after = update(before, problem, rng=rng(), fall_back=never)
+    np.testing.assert_allclose(after.weighted.log_weight, before.weighted.log_weight)
+    assert after.log_z == pytest.approx(before.log_z)
+
+
 @pytest.mark.slow
 def test_what_is_redrawn_has_its_shares_from_the_readings_not_from_where_it_began(small, lattice):
     """Nine in ten of the points are of the half of the posterior where the centre is to the left of its mean."""
@@ -133,6 +142,13 @@ def test_what_is_redrawn_has_its_shares_from_the_readings_not_from_where_it_bega
     found = sampled_about_points(uneven, problem, 8000, rng(2))
     assert found.mean()[0] == pytest.approx(mean[0], abs=0.15 * sd[0])
     assert found.log_z == pytest.approx(log_z, abs=5 * found.log_z_error + 0.05)
+
+
+def test_the_genealogy_tells_when_few_samples_at_the_start_are_ancestors_of_all(small):
+    many = particles(small, n_particles=600, fall_back=None)
+    few = replace(many, ancestor=many.ancestor % 4)
+    assert many.log_z_error < 0.3
+    assert few.log_z_error > 0.4
 
 
 def test_kernels_have_the_density_of_the_gaussians_they_draw_from():

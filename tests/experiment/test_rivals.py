@@ -132,6 +132,14 @@ def laws(*names):
     return [rival.likelihood for rival in rivals() if rival.name in names]
 
 
+@pytest.mark.parametrize("law", laws("outliers", "correlated_noise", "flicker"))
+def test_laws_of_the_residual_alone_are_densities(law):
+    """As the level goes over all levels, so does the residual; its density is one."""
+    level = np.linspace(-600.0, 670.0, 60_001)
+    density = np.exp(law.log_prob(np.array([35.0]), level[:, None]))
+    assert np.trapezoid(density, level) == pytest.approx(1.0, abs=1e-3)
+
+
 @pytest.mark.parametrize("law", laws("dropouts", "signal_dependent_noise", "quantisation"))
 def test_laws_of_the_noise_are_densities(law):
     """The density of one reading over all readings is one."""
@@ -194,6 +202,23 @@ def test_a_step_of_the_light_is_told_by_the_clock_of_the_readings(stepped):
     )
     at_s = [float(re.search(r" at (\d+) ", said)[1]) for said in (early, late)]
     assert at_s[1] - at_s[0] == pytest.approx(5000.0, abs=1.0)
+
+
+def test_a_name_that_the_warier_odds_leave_open_is_in_the_credible_set(stepped):
+    """Two routes: the odds of a name by hand, fourteen times those of a run that expects a fault one time in ten."""
+    last = leading(stepped[-1], "")
+    for name, log_z in (("dropouts", 0.0), ("halo", -2.5)):
+        particles = tuple(
+            replace(p, weighted=replace(p.weighted, log_z=log_z)) if kind.left_out == name else p
+            for kind, p in zip(last.by_kind.kinds, last.by_kind.particles, strict=True)
+        )
+        last = replace(last, by_kind=replace(last.by_kind, particles=particles))
+    share = 0.1 / (len({kind.left_out for kind in last.by_kind.kinds}) - 1)
+    plain, wary = share / (0.9 + share), 14.0 * share / (0.9 + 14.0 * share)
+    said = left_out_after_step(last, 0.9)
+    assert said.probability["dropouts"] == pytest.approx(plain, rel=0.01)
+    assert plain < 0.05 < wary
+    assert said.credible_set == (CLEAN, "dropouts")
 
 
 def test_a_reading_tells_names_by_what_they_predict():

@@ -39,6 +39,16 @@ def test_the_entropy_is_that_of_counting_each_place_by_itself(made):
     np.testing.assert_allclose(ReadingEntropy()(made.listed(predicted)), expected, atol=1e-12)
 
 
+def test_the_next_place_is_drawn_evenly_among_those_that_tie():
+    """Four places within the tie of 1e-9, 4000 draws: chi-square below its 1e-6 quantile."""
+    utility = np.array([0.3, 1.0, 1.0 - 5e-10, 0.9, 1.0, 1.0, 1.0 - 1e-6])
+    reachable = np.ones(7, bool)
+    rng = np.random.default_rng(3)
+    counts = np.bincount([choose(utility, reachable, rng=rng) for _ in range(4000)], minlength=7)
+    assert set(np.flatnonzero(counts)) == {1, 2, 4, 5}
+    assert ((counts[[1, 2, 4, 5]] - 1000) ** 2 / 1000).sum() < 30.7
+
+
 def test_only_places_within_reach_are_chosen_or_asked():
     grid = Grid()
     reachable = grid.places_mm[:, 0] > 900.0

@@ -38,6 +38,15 @@ def test_designs_that_are_none_are_refused(change, name):
         Designs(SMALL, **change)
 
 
+def test_the_grid_is_the_papers_field_row_by_row():
+    grid = Grid()
+    assert grid.n_places == 131 * 65
+    np.testing.assert_allclose(grid.x_mm, np.linspace(0, 1048, 131))
+    np.testing.assert_allclose(grid.y_mm, np.linspace(0, 520, 65))
+    assert grid.image(grid.places_mm[:, 0])[3, 7] == pytest.approx(grid.x_mm[7])
+    assert grid.image(grid.places_mm[:, 1])[3, 7] == pytest.approx(grid.y_mm[3])
+
+
 @pytest.mark.parametrize("change", [{"width_mm": 0.0}, {"n_x": 1}, {"height_mm": float("nan")}])
 def test_a_grid_without_extent_is_refused(change):
     with pytest.raises(ParameterError):

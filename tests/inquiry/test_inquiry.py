@@ -94,6 +94,15 @@ def test_an_inquiry_is_settled_when_every_sd_is_reached():
     assert 2 < len(asked.readings) < 20
 
 
+def test_seconds_count():
+    """Twice the information at the far end is not worth ten times the seconds; travel counts from the last setting."""
+    assert inquiry(cost_s=[1, 1, 1, 1, 10.0]).next() == 1.5
+    asked = inquiry(cost_s=lambda last: np.ones(5) if last is None else 0.01 + 100 * np.abs(PLACES - last))
+    asked.tell(0.3, 1.0)
+    assert asked.next() == 1.0
+    assert asked.utility_label.endswith("per second")
+
+
 def test_a_reading_without_its_setting_is_taken_once_for_each_choice():
     asked = inquiry()
     for _ in range(2):

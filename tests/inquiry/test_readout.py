@@ -28,6 +28,13 @@ def test_the_cells_of_a_rounding_sensor_are_its_readings():
     assert chance[0, reading == 30.0] == pytest.approx(norm.cdf(0.3 / 0.8) - norm.cdf(-0.7 / 0.8))
 
 
+def test_the_ends_of_the_scale_take_all_beyond():
+    readout = Readout(2.0, 1.0, 1.0, 100.0)
+    chance = readout.cell_probability(np.array([0.0, 99.5]))
+    assert chance[0, 0] == pytest.approx(norm.cdf(1.5 / 2.0))
+    assert chance[1, -1] == pytest.approx(norm.sf(0.0))
+
+
 @pytest.mark.parametrize("sd", [0.1, 0.29, 0.4])
 @pytest.mark.parametrize("black", [10.0, 10.5])
 def test_the_information_of_a_reading_counts_the_noise_at_each_level(sd, black):
@@ -74,6 +81,18 @@ def test_a_reading_that_the_sensor_cannot_return_is_refused():
 def test_a_readout_out_of_range_is_refused(change):
     with pytest.raises(ParameterError):
         Readout(**{"noise_sd": 1.0, **change})
+
+
+def test_cells_taken_together_hold_what_they_held_apart():
+    levels = np.linspace(1000.0, 60000.0, 50)
+    readout = Readout(100.0, 1.0, 0.0, 65535.0)
+    edges = readout.cell_edges(levels, most=300)
+    assert len(edges) <= 301
+    assert (edges % 1.0 == 0.5).all()  # no reading lies on one
+    together = readout.cell_probability(levels, most=300)
+    expected = norm.cdf(edges[:, None], levels, 100.0).T
+    np.testing.assert_allclose(np.cumsum(together, axis=1)[:, :-1], expected, atol=1e-12)
+    np.testing.assert_allclose(together.sum(axis=1), 1.0)
 
 
 def test_two_levels_far_apart_carry_at_least_a_bit_and_noise_free_steps_their_log():

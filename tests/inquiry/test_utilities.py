@@ -156,3 +156,8 @@ def test_far_from_the_end_or_without_a_goal_information_decides(made):
     np.testing.assert_array_equal(Finishing()(goalless), InformationGain()(goalless))
     hopeless = narrow(made, Goal((0, 1, 2), 1.0))
     np.testing.assert_array_equal(Finishing()(hopeless), InformationGain()(hopeless))
+
+
+def test_the_bins_of_entropy_are_as_wide_as_the_instruments_step():
+    assert utility_named("entropy", bin_width=0.005) == ReadingEntropy(0.005)
+    assert utility_named("entropy") == ReadingEntropy(1.0)

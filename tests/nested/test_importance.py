@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import chi2, norm
 
 from probewise._arrays import FloatArray
-from probewise.nested import Weighted, run, update
+from probewise.nested import Weighted, pareto_k, run, update
 from probewise.nested.clusters import find_disconnected_clusters
 from probewise.nested.importance import (
     _bridge_sampling_estimate,
@@ -133,3 +133,12 @@ def test_a_reading_that_surprises_is_inferred_from_scratch():
     assert found.sound
     assert abs(found.log_z - odd.log_z) < 4 * found.log_z_error
     assert found.n_calls > found.run.n_calls
+
+
+def test_the_shape_of_a_tail_is_found():
+    """Weights with a Pareto tail of shape k have P(weight > w) = w**(-1/k)."""
+    u = np.random.default_rng(4).random(100_000)
+    for k in (0.3, 0.6, 1.0):
+        assert pareto_k(-k * np.log(u)) == pytest.approx(k, abs=0.15)
+    # Of equal weights one of the candidate shapes is the exponential's, where the formula is nought over nought.
+    assert np.isfinite(pareto_k(np.concatenate([np.zeros(1890), np.full(110, np.log(2.0))])))

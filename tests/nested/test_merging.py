@@ -1,6 +1,7 @@
 """Merged runs: counts by births and deaths against counts kept by the sampler, evidences against known ones."""
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -9,6 +10,9 @@ from nested_sampling import problems
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.nested import merge, run
 from probewise.nested.result import n_alive_at_death
+from probewise.priors import Product, Uniform
+
+N_ERRORS = 3.9
 
 
 def several(problem, n_runs, *, n_live=50, seed=5, max_cost=5.0):
@@ -48,6 +52,20 @@ def test_merged_runs_are_one_run_with_the_live_points_of_all(terraces, rng):
     assert np.array_equal(alive(merged), merged.n_at_death)
     assert not merged.warnings
     assert merged.memory == pytest.approx(np.mean([r.memory for r in terraces]))
+
+
+def test_the_possible_share_of_the_prior_is_pooled(rng):
+    """A ball in a box: a pooled share of found over drawn, and the evidence is the share."""
+    prior = Product({"x": Uniform(-1, 1), "y": Uniform(-1, 1)})
+    disc = problems.Known(prior, lambda t: np.where((t**2).sum(axis=1) < 0.5, 0.0, -np.inf), math.log(math.pi / 8))
+    runs = [run(disc, rng=np.random.default_rng(n), n_live=n) for n in (100, 300)]
+    merged = merge(runs, rng=rng)
+    drawn = [r.n_live / math.exp(r.log_start) for r in runs]
+    share = 400 / sum(drawn)
+    assert math.exp(merged.log_start) == pytest.approx(share)
+    assert merged.log_start_error == pytest.approx(math.sqrt((1 - share) / 400))
+    assert abs(merged.log_z - disc.log_z) < N_ERRORS * merged.log_z_error
+    assert "of the prior" in merged.summary()
 
 
 def test_runs_that_disagree_say_so_and_widen_the_error(terraces, rng):

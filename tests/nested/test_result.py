@@ -65,6 +65,17 @@ def test_a_file_of_another_format_says_so_even_where_its_arrays_have_other_names
             NestedResult.load(path)
 
 
+def test_equally_weighted_samples_follow_the_weights(result):
+    weight = np.zeros(result.n_dead)
+    weight[[3, 5]] = 0.25, 0.75
+    with np.errstate(divide="ignore"):
+        known = dataclasses.replace(result, log_weight=np.log(weight))
+    drawn = known.samples(400, rng=np.random.default_rng(0))
+    assert (drawn == result.theta[5]).all(axis=1).sum() == pytest.approx(300, abs=1)
+    assert (drawn == result.theta[3]).all(axis=1).sum() == pytest.approx(100, abs=1)
+    assert known.mean() == pytest.approx(0.25 * result.theta[3] + 0.75 * result.theta[5])
+
+
 def test_quantiles_of_equal_weights_are_the_plain_ones(result):
     n = result.n_dead
     plain = dataclasses.replace(result, log_weight=np.full(n, -np.log(n)))

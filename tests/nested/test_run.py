@@ -20,7 +20,7 @@ from probewise.nested import (
     run,
 )
 from probewise.nested.clusters import find_clusters
-from probewise.nested.evidence import insertion_p_value
+from probewise.nested.evidence import insertion_p_value, insertion_ranks
 from probewise.nested.sampler import replace_worst_live_points, run_once
 from probewise.nested.save import LivePoints
 from probewise.priors import Normal, Product
@@ -94,6 +94,16 @@ def test_one_step_by_hand_replaces_the_worst(rng):
     assert dead.theta[:, 0].tolist() == [0.1, 0.3]
     assert (after.log_likelihood > 0.3).all()
     assert after.log_birth.tolist() == [-np.inf, -np.inf, -np.inf, 0.3, 0.3]
+
+
+def test_ranks_of_new_points_count_the_worse_ones_alive_when_they_came():
+    """Five points; two rounds of two: 0.1 and 0.3 die for 0.6 and 0.4, then 0.4 and 0.5 for 0.95 and 0.8."""
+    place = np.array([0.1, 0.5, 0.3, 0.9, 0.7, 0.6, 0.4, 0.95, 0.8])  # in order of birth
+    ident = np.array([0, 2, 6, 1, 5, 4, 8, 3, 7])  # in order of death
+    assert (np.diff(place[ident]) > 0).all()
+    rank, n_ranked = insertion_ranks(ident, 5, 2)
+    assert rank.tolist() == [1, 0, 3, 2]
+    assert n_ranked.tolist() == [3, 4, 3, 4]
 
 
 @pytest.mark.parametrize("starts_live", [True, False])
@@ -207,6 +217,19 @@ def test_insertion_ranks_of_a_wrong_sampler_are_found(rng):
     assert insertion_p_value(rng.integers(0, 90, 2000), m, rng=rng) < 1e-6
     early = np.concatenate([rng.integers(0, 60, 200), rng.integers(0, 100, 1800)])
     assert insertion_p_value(early, m, rng=rng) < 1e-4
+
+
+def test_clusters_are_found_where_they_are_and_not_where_they_are_not(rng):
+    ball = rng.standard_normal((300, 5))
+    ball *= rng.random((300, 1)) ** (1 / 5) / np.linalg.norm(ball, axis=1, keepdims=True)
+    assert len(find_clusters(ball)) == 1
+    assert len(find_clusters(rng.random((300, 5)))) == 1
+    two = np.concatenate([0.1 * ball[:220], 0.05 * ball[220:] + 0.5])
+    clusters = find_clusters(two)
+    assert len(clusters) == 2
+    home = clusters.assign(two)
+    assert len(np.unique(home[:220])) == len(np.unique(home[220:])) == 1
+    assert home[0] != home[-1]
 
 
 def test_the_papers_rule_ends_a_run_on_a_plateau_before_its_points_are_copies():

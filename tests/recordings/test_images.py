@@ -41,6 +41,14 @@ def test_a_grey_picture_is_written_as_it_is_read_also_with_a_palette(tmp_path):
     np.testing.assert_allclose(read_image(tmp_path / "p.png"), SMOOTH / 255, atol=1e-14)
 
 
+def test_transparent_palette_entries_reflect_nothing(tmp_path):
+    more = chunk(b"PLTE", bytes([255, 255, 255, 51, 51, 51])) + chunk(b"tRNS", bytes([0]))
+    (tmp_path / "a.png").write_bytes(png(2, 1, bytes([0, 0, 1]), colour=3, more=more))
+    np.testing.assert_allclose(read_image(tmp_path / "a.png"), [[0.0, 0.2]])
+    (tmp_path / "a.png").write_bytes(png(2, 1, bytes([0, 51, 102]), more=chunk(b"tRNS", bytes([0, 51]))))
+    np.testing.assert_allclose(read_image(tmp_path / "a.png"), [[0.0, 0.4]])
+
+
 GOOD = png(2, 1, bytes([0, 10, 20]))
 DAMAGED = {
     "not a png": b"GIF89a",

@@ -25,11 +25,26 @@ from probewise.recordings import (
 WHITE = {"white": {"kind": "uniform", "albedo": 1}}
 
 
+TWO = {**WHITE, "edge": {"kind": "half_plane", "normal_deg": 90, "offset_mm": 2}}
+
+
 def put(folder, csv, patterns=WHITE, **more):
     content = {"format": "recording/1", "reading": {"unit": "LEGO", "min": 0, "max": 100}, "patterns": patterns, **more}
     (folder / "rec.csv").write_bytes(csv if isinstance(csv, bytes) else csv.encode())
     (folder / "rec.json").write_text(json.dumps(content))
     return folder / "rec.csv"
+
+
+def test_what_is_not_said_is_taken_by_default(tmp_path):
+    recording = read_recording(put(tmp_path, "reading,x_mm,y_mm\n1,2,3\n4,5,6\n7,8,9\n"))
+    plan = recording.plan
+    np.testing.assert_array_equal(plan.orientation_rad, 0)
+    np.testing.assert_array_equal(plan.scan, 0)
+    np.testing.assert_array_equal(np.diff(plan.time_s), 1)
+    assert plan.pattern_names == ("white",)
+    assert recording.notes == ()
+    assert plan.instrumentation.step is None
+    assert plan.instrumentation.controls == ()
 
 
 def test_byte_order_mark_crlf_quotes_blanks_and_empty_lines_are_accepted(tmp_path):
@@ -45,6 +60,13 @@ def test_a_session_is_a_number_of_each_scan_and_one_session_is_none(tmp_path):
     assert read_plan(put(tmp_path, csv.format(0))).sessions == ()
     said = read_recording(put(tmp_path, "x_mm,y_mm,reading,session\n0,0,1,noon\n0,0,2,noon\n"))
     assert (said.plan.sessions, said.notes) == ((), ("column session is text, ignored",))
+
+
+def test_missing_and_out_of_range_readings_are_counted_and_left_out(tmp_path):
+    recording = read_recording(put(tmp_path, "x_mm,y_mm,reading\n0,0,\n0,0,NaN\n0,0,101\n0,0,50\n0,0,0\n0,0,1e200\n"))
+    np.testing.assert_array_equal(recording.usable, [False, False, False, True, True, False])
+    assert recording.notes == ("2 readings missing, left out", "2 readings outside 0 to 100, left out")
+    assert recording.readings[2] == 101
 
 
 def test_other_numbers_are_covariates_and_other_texts_are_noted(tmp_path):
@@ -151,6 +173,11 @@ def test_a_bad_table_is_answered_with_file_row_and_column(tmp_path, what):
     assert "\n" not in message
     for fragment in fragments:
         assert fragment in message
+
+
+def test_a_pattern_must_be_named_where_there_are_several(tmp_path):
+    with pytest.raises(FileError, match=r"row 1, column pattern: .*2 patterns"):
+        read_recording(put(tmp_path, HEAD + "0,0,1\n", TWO))
 
 
 def described(**patterns):

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from types import SimpleNamespace
 
+import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
@@ -18,9 +19,11 @@ from probewise.priors import Product, Uniform
 from probewise.proof import pages as of_campaigns
 from probewise.proof.campaign import Estimate, estimated_share
 from probewise.proof.concealed_study import ConcealedRow
-from probewise.recordings import Recording, read_recording, shipped
+from probewise.recordings import Recording, paper_plan, read_recording, shipped
 from probewise.report import plots
 from probewise.report.exploration import animated_gif
+from probewise.report.plots import canvas
+from probewise.report.plots.readings import tracks_and_single_rows
 from probewise.report.residual_means import mean_residuals
 from probewise.sensor import SSFField
 
@@ -225,6 +228,15 @@ def test_readings_without_a_unit_have_no_empty_brackets():
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("time (s)", "mean residual")
 
 
+def test_the_papers_plan_has_four_lines_and_four_readings_alone():
+    found, alone = tracks_and_single_rows(paper_plan())
+    assert [len(t.rows) for t in found] == [101] * 4
+    assert [t.label for t in found] == ["0°", "90°", "180°", "270°"]
+    assert len(alone) == 4
+    for track in found:
+        np.testing.assert_allclose(np.sort(track.along_mm), np.arange(-50.0, 51.0), atol=1e-9)
+
+
 def test_predictions_get_a_panel_a_scan_and_one_for_the_readings_alone(recording):
     axes = plots.predicted_and_recorded_by_scan(recording, recording.readings, np.ones(len(recording)))
     assert sum(ax.get_visible() for ax in axes.flat) == 5
@@ -232,6 +244,14 @@ def test_predictions_get_a_panel_a_scan_and_one_for_the_readings_alone(recording
     many = Recording(plan, np.full(len(plan), 30.0))
     axes = plots.predicted_and_recorded_by_scan(many, many.readings, np.ones(len(many)))
     assert sum(ax.get_visible() for ax in axes.flat) <= 8
+
+
+def test_the_field_shows_readings_by_brightness_and_the_next_place():
+    ax = plots.playing_field(**field())
+    squares, green = ax.collections[1:]
+    np.testing.assert_allclose(squares.get_facecolors()[:, :3], [[0, 0, 0], [1, 1, 1]])
+    np.testing.assert_allclose(green.get_offsets(), [[700.0, 300.0]])
+    assert "mm" in ax.get_xlabel()
 
 
 @pytest.mark.slow
@@ -275,6 +295,17 @@ def test_frames_follow_each_other():
 def test_the_same_drawing_gives_the_same_bytes():
     first, second = (plots.svg(plots.heldout_gain_by_scan([("edge_0", 0.5)], 0.2, 0.05)) for _ in range(2))
     assert first == second
+
+
+def test_a_name_is_drawn_as_it_is_written_whatever_style_is_set():
+    """Neither as a formula, nor by LaTeX, which may not be there; powers along a logarithmic axis are formulas."""
+    with mpl.rc_context({"text.usetex": True}):
+        ax = canvas.axes_or_new(None)
+        ax.plot([1, 1000])
+        ax.set(yscale="log", xlabel=r"$\frac{1}$ of $5 in a_b, %")
+        drawn = canvas.svg(ax).decode()
+    assert r"$\frac{1}$ of $5 in a_b, %" in drawn
+    assert r"$\mathdefault{10^{2}}$" in drawn
 
 
 def test_rounded_readings_lie_on_their_lattice():

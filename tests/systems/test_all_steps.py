@@ -1,5 +1,7 @@
 """All steps of a law solved at once, against stepping through them: the same equations, so the same states."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -78,6 +80,37 @@ def test_all_steps_at_once_lead_where_stepping_leads(effect, apart):
         np.testing.assert_allclose(found[state], expected, atol=1e-9)
 
 
+def test_near_a_known_trajectory_a_derivative_costs_a_fraction_of_stepping():
+    """Forward differences with a step of 1e-5: to the rounding of either way, 1e-9."""
+    case = _Case()
+    case.near(MIDDLE[None, :])
+    case.memory.n_evaluations = 0
+    theta = MIDDLE + np.concatenate([np.zeros((1, 3)), 1e-5 * np.eye(3)])
+    found = case.near(theta)
+    slopes, expected = (np.diff(v["phi"], axis=0) / 1e-5 for v in (found, case.stepped(theta)))
+    np.testing.assert_allclose(slopes, expected, atol=1e-5)
+    steps = steps_for_table(case.table, 0.02)
+    assert case.memory.n_evaluations < 0.2 * len(steps.gap) * 4
+
+
+@pytest.mark.parametrize("effect", [_plain, _rubbed, _stopped, _forced])
+@pytest.mark.parametrize("max_step", [0.02, 0.2])
+def test_the_cost_is_how_often_the_rates_are_evaluated(effect, max_step):
+    """Exactly where nothing splits a step; friction splits those in which a state comes to rest."""
+    n_calls = 0
+
+    def rates(s, p, u):
+        nonlocal n_calls
+        n_calls += 1
+        return LAW.rates(s, p, u)
+
+    case = _Case(effect, law=replace(LAW, rates=rates))
+    theta = MIDDLE * (1 + 0.1 * np.random.default_rng(2).normal(size=(6, 3)))
+    steps = steps_for_table(case.table, max_step)
+    integrate_from_known_trajectories(case.problem(theta), steps, case.memory, effects="effects", theta=theta, n_own=3)
+    assert case.memory.n_evaluations == pytest.approx(n_calls, rel=0.5 if effect is _rubbed else 0.01)
+
+
 def test_a_sample_that_diverges_is_as_infinite_as_in_steps():
     case = _Case(law=Law({"phi": "phi0", "omega": 0.0}, lambda s, p, u: {"phi": s["phi"] ** 2, "omega": 0 * u["push"]}))
     case.near(MIDDLE[None, :] * 0.1)
@@ -87,6 +120,22 @@ def test_a_sample_that_diverges_is_as_infinite_as_in_steps():
     assert not np.isfinite(expected[1]).all()
     np.testing.assert_array_equal(np.isfinite(found["phi"]), np.isfinite(expected))
     np.testing.assert_allclose(found["phi"][0], expected[0], rtol=1e-9)
+
+
+def test_a_column_that_a_law_reads_later_only_is_there():
+    """Not at the first rows: it is pushed from the first second on."""
+
+    def rates(s, p, u):
+        push = np.where(u["t_s"] > 1, u["push"], 0.0) if np.max(u["t_s"]) > 1 else 0.0
+        return {**LAW.rates(s, p, {"push": 0.0}), "omega": -9.81 * np.sin(s["phi"]) + push}
+
+    case = _Case(law=replace(LAW, rates=rates))
+    theta = np.stack([MIDDLE, 1.01 * MIDDLE])
+    found = case.stepped(theta)["phi"]
+    assert np.isfinite(found).all()
+    for _ in range(2):
+        again = case.near(theta)
+        np.testing.assert_allclose(again["phi"], found, rtol=1e-8, atol=1e-10)
 
 
 def test_the_memory_of_trajectories_does_not_grow_without_end():

@@ -31,6 +31,13 @@ def _with_a_loop(p, data):
     return out
 
 
+def test_a_function_that_broadcasts_is_called_once_for_all_samples():
+    system, table = _system(_elementwise)
+    system.caller.n_calls = 0
+    system.chain(table, ()).predict(system.theta(system.starts), table)
+    assert system.caller.n_calls == 1
+
+
 def test_a_caller_is_pickled_without_the_progress_that_it_tells():
     caller = Caller(_elementwise, broadcasts=True)
     progress_with_call_count(lambda *told: None, caller)("fitting")
@@ -115,6 +122,16 @@ def _raises(p, data):
 def test_a_simulator_that_never_gives_readings_is_refused(simulate, error, said):
     with pytest.raises(error, match=said):
         _system(simulate)
+
+
+def test_the_same_call_is_made_once():
+    """Effects on the reading leave the simulator as it was: their derivatives cost no further calls."""
+    system, table = _system(_with_a_loop)
+    theta = system.theta(system.starts)
+    first = system.chain(table, ()).predict(theta, table)
+    n_calls = system.caller.n_calls
+    np.testing.assert_array_equal(system.chain(table, ()).predict(theta, table), first)
+    assert system.caller.n_calls == n_calls
 
 
 def test_a_law_that_raises_for_some_parameters_is_counted_and_the_others_are_integrated():

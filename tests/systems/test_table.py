@@ -63,6 +63,12 @@ def test_rows_without_a_run_and_dates_without_marks_are_noted_once():
     assert not RunTable({"run": ["", ""], "t": [20261301, 20261302]}, run="run", time="t").notes
 
 
+def test_a_simulator_gets_names_of_runs_as_numbers_only_if_they_are_different_numbers():
+    for given, expected in ((["1", "02"], [1.0, 2.0]), (["1.1", "1.10"], ["1.1", "1.10"]), (["1", "b"], ["1", "b"])):
+        table = RunTable({"run": given, "x": [0.0, 1.0]}, run="run")
+        assert table.columns_as_given["run"].tolist() == expected
+
+
 _FIRST = datetime.datetime(2026, 11, 23, 18, 0)
 _END_OF_SUMMER = datetime.datetime(2026, 10, 25, 0, 59, 59, tzinfo=datetime.UTC)  # clocks go back a second later
 _LATER = [datetime.timedelta(seconds=s) for s in (0, 2, 90)]
@@ -127,3 +133,12 @@ def test_the_same_table_twice_or_texts_where_the_first_has_numbers_are_refused()
     cells[2] = "warm"
     with pytest.raises(ParameterError, match=r"column 'room_c' of b.csv in row 4 is 'warm'"):
         concatenate_tables([runs(), second.with_columns({"room_c": cells})], ["a.csv", "b.csv"])
+
+
+def test_runs_named_by_numbers_are_joined_with_runs_named_by_texts():
+    first = RunTable({"day": [1.0, 1.0, 2.0], "x": [1.0, 2.0, 3.0]}, run="day")
+    advised = RunTable({"day": ["1 again", "1 again"], "x": [1.0, 2.0]}, run="day")
+    joined, _ = concatenate_tables([first, advised], ["a.csv", "next.csv"])
+    assert joined.scan_names == ("1", "2", "1 again")
+    assert list(joined.columns) == ["day", "x"]
+    assert concatenate_tables([advised, first], ["next.csv", "a.csv"])[0].scan_names == ("1 again", "1", "2")

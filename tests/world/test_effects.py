@@ -305,6 +305,44 @@ def test_height_scales_the_footprint_and_dims_by_the_inverse_square(name, is_com
         np.testing.assert_allclose(got[white], BLACK + SPAN / scale[white] ** 2, atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    "effect", [known.height_gradient(0.05), known.height_offset(2.0, ("out",)), known.sensor_tilt(0.7, -0.4)]
+)
+def test_a_plan_that_commands_heights_is_read_as_the_arm_reads_at_them(effect, plan):
+    """Row by row through `World.read`; a row without a height, or without a state of the LED, is as usual."""
+    rows = np.array([3, 20, 31, 44])
+    plan = plan.take(rows)
+    heights, led = np.array([9.0, np.nan, 20.0, 25.0]), np.array([1.0, 1.0, np.nan, 0.5])
+    commanded = replace(plan, covariates={"height_mm": heights, "led": led})
+    world = World(SPOT, black=BLACK, white=BLACK + SPAN, concealed=(effect,))
+    if effect.name == "height_offset":
+        # A single reading belongs to a scan without a name.
+        world = replace(world, concealed=(known.height_offset(2.0, ("", *plan.scan_names)),))
+    alone = [
+        world.read(
+            plan.patterns[plan.pattern_names[plan.pattern[k]]],
+            plan.x_mm[k],
+            plan.y_mm[k],
+            plan.orientation_rad[k],
+            time_s=plan.time_s[k],
+            rng=None,
+            height_mm=None if np.isnan(heights[k]) else heights[k],
+        )
+        for k in range(len(plan))
+    ]
+    expected = BLACK + np.where(np.isnan(led), 1.0, led) * (np.array(alone) - BLACK)
+    np.testing.assert_allclose(world.expected_readings(commanded), expected, atol=1e-9)
+    assert np.abs(world.expected_readings(commanded) - world.expected_readings(plan)).max() > 1.0
+
+
+@BOTH
+def test_a_tilt_moves_the_spot_of_a_raised_sensor_farther(of, plan):
+    """At twice the height by twice as much: as a pattern that is moved back by that."""
+    raised = replace(plan, covariates={"height_mm": np.full(len(plan), 28.0)})
+    shifted = replace(raised, x_mm=plan.x_mm + 2 * 0.7, y_mm=plan.y_mm - 2 * 0.4)
+    np.testing.assert_allclose(of(raised, ("sensor_tilt", (0.7, -0.4))), of(shifted), atol=1e-9)
+
+
 def test_effects_of_scene_footprint_and_pose_stack_as_physics_does(plan):
     """A graded and stained scene under a raised, tilted and lagging sensor, over a boundary and over a disc."""
     scene = [("albedo_gradient", (0.004, -0.007)), ("albedo_patch", (-0.3, 3.0, -2.0, 5.0))]

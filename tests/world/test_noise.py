@@ -60,6 +60,14 @@ def test_another_noise_sd_scales_the_noise(noise):
     np.testing.assert_allclose(noise(known.noise_sd(3.0)), 3.0 * noise(), atol=1e-9)
 
 
+def test_drifting_noise_grows_to_its_factor_and_stays(noise, ramp):
+    z = noise(known.drifting_noise(2.0, N / 2))
+    late = z[ramp.time_s > N / 2]
+    assert abs(late.std() / 2 - 1) < 4 / math.sqrt(2 * len(late))
+    early = z[:1000] / (1 + ramp.time_s[:1000] / (N / 2))
+    assert abs(early.std() - 1) < 4 / math.sqrt(2 * len(early))
+
+
 def test_heavy_tails_are_student_t_of_the_same_sd(noise):
     z = noise(known.heavy_tails(4.0))
     assert kstest(z * math.sqrt(2), t(4).cdf).pvalue > 1e-4

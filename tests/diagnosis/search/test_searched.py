@@ -60,6 +60,12 @@ def of(log_z):
     return Evidences({(0, names): SimpleNamespace(log_z=value) for names, value in {(): 0.0, **log_z}.items()})
 
 
+@pytest.mark.parametrize(("named", "known"), [(51.0, ("offset_drift",)), (49.0, ("unknown",))])
+def test_a_formula_beside_a_name_counts_as_the_name_if_that_explains_more(named, known):
+    evidences = of({("offset_drift",): named, (FORMULA, "offset_drift"): 100.0})
+    assert evidences.reported_as((FORMULA, "offset_drift")) == known
+
+
 def test_the_formula_beside_names_is_that_of_largest_evidence_which_adds_formulas_alone():
     def fit(log_z, *names):
         evidence = {("outliers",): SimpleNamespace(log_z=log_z)}
@@ -71,6 +77,18 @@ def test_the_formula_beside_names_is_that_of_largest_evidence_which_adds_formula
     evidences = Evidences({(0, tuple(sorted(each.names))): each for each in (alone, more, best, *others)})
     assert evidences.best_formula_beside(alone, ("outliers",)) is best
     assert evidences.best_formula_beside(others[2], ("outliers",)) is None
+
+
+@pytest.mark.parametrize(
+    ("named", "stays"), [(16.0, True), (14.0, False)], ids=["over half of all that is explained", "less than half"]
+)
+def test_a_name_stays_if_it_explains_more_than_all_that_has_no_name(named, stays):
+    """A gradient of 14 nats, a reflection that adds 10 and an unknown effect that adds 6: 14 of 30 have a name."""
+    white: tuple[str, ...] = ()
+    of_names = {(): 0.0, ("albedo_gradient",): named, ("albedo_gradient", "reflection"): 24.0}
+    fits = {(2, names): SimpleNamespace(evidence={white: SimpleNamespace(log_z=z)}) for names, z in of_names.items()}
+    evidences = Evidences(fits, unknown={(2, ("albedo_gradient", "reflection"), white): 30.0})
+    assert evidences.named_outweigh_unknown(2, ("albedo_gradient", "reflection"), white) is stays
 
 
 def test_a_name_stands_beside_what_is_unknown_in_its_share_of_the_evidence():

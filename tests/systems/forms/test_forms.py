@@ -11,7 +11,7 @@ from probewise.effects.effect import sentence_from_samples
 from probewise.systems import Extra, Law, Noise, RunTable, Simulator, System
 from probewise.systems.forms import ReferenceFit, bind_forms
 from probewise.systems.forms.formulas import formula_forms
-from probewise.systems.forms.reference import clipping_between
+from probewise.systems.forms.reference import clipping_between, switch_points
 from probewise.systems.law import LawWithEffects
 
 SD = 0.01
@@ -73,6 +73,22 @@ def test_a_curve_is_a_polynomial_in_the_scaled_column_of_an_order_of_two_to_five
     assert form.sentence(np.array([0.1, 0.2, 0, 0, 0]), np.array([0.01, 0.01, 1e-12, 1e-12, 1e-12])).count("z^") == 1
 
 
+def test_a_column_that_moves_both_ways_may_have_dry_friction_sharp_or_smooth():
+    sharp, smooth = FORMS["friction:drive"].variants()
+    drive = TABLE.columns["drive"]
+    width = sharp.entries[0, 0, 1]
+    np.testing.assert_allclose(_read("friction:drive", 0.2, width) - NOTHING, 0.2 * np.sign(drive), atol=1e-12)
+    np.testing.assert_allclose(_read("friction:drive", 0.2, 0.5) - NOTHING, 0.2 * np.tanh(drive / 0.5), atol=1e-12)
+    assert (sharp.fixed, smooth.fixed) == (("width",), ())
+    assert "friction:room_c" not in FORMS
+
+
+def test_a_switch_has_five_rows_and_three_values_on_either_side():
+    assert switch_points(np.arange(9.0)).size == 0
+    np.testing.assert_array_equal(switch_points(np.arange(12.0)), [4.0, 5.0, 6.0, 7.0])
+    np.testing.assert_array_equal(switch_points(np.repeat([0.0, 1.0, 2.0, 3.0, 4.0, 5.0], 4)), [2.0, 3.0])
+
+
 @pytest.mark.parametrize("name", sorted(name for name, form in FORMS.items() if form.nothing))
 def test_a_form_at_nothing_changes_nothing(name):
     form = FORMS[name]
@@ -128,6 +144,13 @@ def test_hysteresis_goes_by_the_way_in_which_the_reading_moves_with_all_that_is_
     np.testing.assert_allclose(found - NOTHING - 100.0 * _T, 0.05, atol=1e-9)
 
 
+def test_a_gain_counts_from_the_reading_of_nothing():
+    how = {"parameters": {"gain": (0, 4)}, "simulate": lambda p, u: 1.0 + p["gain"] * u["drive"]}
+    about = _about(_simulator(**how, noise=Noise(sd=SD, zero=1.0)))
+    found = _read("gain_drift", 0.1, about=about, forms=bind_forms(about))
+    np.testing.assert_allclose(found, 1.0 + (about.predicted - 1.0) * (1 + 0.1 * _T))
+
+
 def test_an_input_delay_looks_the_column_up_as_it_was():
     """Closed form: a column on straight lines between rows, 0.4 s earlier, as at the start before it."""
     expected = NOTHING.copy()
@@ -157,6 +180,18 @@ def test_an_extra_effect_of_a_file_is_bound_with_its_own_prior_and_sentence():
 def test_a_term_that_adds_to_a_rate_is_told_without_a_double_negative(a, told):
     damping = bind_forms(_about_law(_rising, max_step_s=0.2))["damping:x"]
     assert damping.sentence(np.array([a]), np.array([0.02])) == f"the rate of x lacks {told}"
+
+
+def test_an_input_is_cut_off_below_as_well_as_above():
+    """On u = drive and y = offset + gain u: what is cut off is the drive."""
+    drive, form = TABLE.columns["drive"], FORMS["input_saturation:drive"]
+    offset, gain = ABOUT.theta[0]
+    for level, cut in ((0.7, np.minimum), (-0.6, np.maximum)):
+        np.testing.assert_allclose(_read(form.name, level), offset + gain * cut(drive, level))
+    np.testing.assert_allclose(_read(form.name, form.nothing[0]), ABOUT.predicted)
+    said = [form.sentence(np.array([level]), np.array([0.01])) for level in (0.7, -0.6)]
+    assert "rises no further" in said[0]
+    assert "falls no further" in said[1]
 
 
 def test_levels_of_a_clipping_are_between_the_values():
@@ -247,6 +282,22 @@ def test_an_overflow_goes_to_waste_or_into_a_state_that_it_drives():
     assert "takes up" not in wasted.sentence(np.array([level, 5e-10]), np.array([0.01, 3e-10]))
 
 
+def test_a_loop_that_holds_its_input_is_told_from_a_formula_of_the_row():
+    """Of x' = (u - x) / tau by hand, u held from row to row, the next reading is the first to depend on u."""
+
+    def simulate(p, u):
+        out = np.zeros(N_ROWS)
+        for k in range(1, N_ROWS):
+            stays = np.exp(-max(_T[k] - _T[k - 1], 0.0) / p["tau_s"])
+            out[k] = stays * out[k - 1] + (1 - stays) * u["drive"][k - 1]
+        return out
+
+    loop = _about(_simulator(parameters={"tau_s": (0.5, 2.0)}, simulate=simulate))
+    assert loop.is_held_between_rows("drive")
+    assert not loop.is_held_between_rows("room_c")
+    assert not ABOUT.is_held_between_rows("drive")
+
+
 def _proposed(ending, about=ABOUT):
     (form,) = [form for form in formula_forms(about) if form.name.endswith(ending)]
     return form
@@ -310,6 +361,20 @@ def test_a_term_on_one_side_acts_beyond_its_threshold_alone():
     found = _read(form.name, -0.5, 2.0, about=about, forms={form.name: form})
     beyond = np.maximum(_T - 2.0, 0.0)
     np.testing.assert_allclose(found, np.minimum(_T, 2.0) + (1 - np.exp(-0.5 * beyond)) / 0.5, atol=1e-3)
+
+
+def test_a_form_that_looks_back_to_earlier_times_says_so():
+    """Route two: the time of one row is moved, and other rows change if and only if a form looks back."""
+    moved = _T.copy()
+    moved[10] += 0.05
+    later, others = TABLE.with_columns({"t_s": moved}), np.arange(N_ROWS) != 10
+    for form in (*FORMS.values(), *formula_forms(ABOUT)):
+        theta = np.concatenate([ABOUT.theta[0], form.entries[len(form.entries) // 2, 0]])[None, :]
+        chain = ABOUT.system.chain(TABLE, [form])
+        change = (chain.predict(theta, later) - chain.predict(theta, TABLE))[0]
+        assert form.needs_rising_time == bool(np.any(change[others] != 0)), form.name
+    named = {name.partition(":")[0] for name, form in FORMS.items() if form.needs_rising_time}
+    assert named == {"lag", "delay", "input_delay"}
 
 
 def test_the_rates_of_a_law_lack_nothing_where_no_time_passes():
@@ -396,6 +461,14 @@ def test_rows_are_predicted_alone_only_where_neither_the_simulator_nor_an_effect
     assert not {"lag", "delay", "hysteresis", "backlash:drive", "input_delay:drive"} & alone
     adding_up = System.of(_simulator(simulate=lambda p, u: p["offset"] + p["gain"] * np.cumsum(u["drive"])), TABLE)
     assert adding_up.part_that_predicts(rows, TABLE, ())[0] is TABLE
+
+
+def test_a_share_of_the_reading_fades_from_the_start_of_each_run():
+    form = _proposed("s the t_s since the start of the run")
+    y = np.linspace(1.0, 3.0, N_ROWS)[None, :]
+    since = np.concatenate([_T[rows] - _T[rows][0] for rows in (slice(0, N_ROWS // 2), slice(N_ROWS // 2, N_ROWS))])
+    found = form.apply(y, np.array([[0.2, 1.5]]), TABLE)[0]
+    np.testing.assert_allclose(found, y[0] * (1 + 0.2 * np.exp(-since / 1.5)))
 
 
 def test_what_differs_from_run_to_run_is_told_from_the_median_of_the_runs():

@@ -32,6 +32,14 @@ def test_a_smooth_reading_lags_as_its_differential_equation_says(tau):
     assert np.abs(held - exact).max() > 3 * np.abs(smooth - exact).max()
 
 
+@pytest.mark.parametrize("tau", [0.05, 0.7])
+def test_a_smooth_reading_is_delayed_between_its_rows(tau):
+    exact = _reading(np.maximum(_T - tau, _T[0]))
+    smooth, straight = delayed_readings(_reading(_T)[None], np.array([[tau, 1.0], [tau, 0.0]]), _rows())
+    np.testing.assert_allclose(smooth, exact, atol=3e-3)
+    np.testing.assert_allclose(straight, np.interp(np.maximum(_T - tau, _T[0]), _T, _reading(_T)), atol=1e-12)
+
+
 @pytest.mark.parametrize(("between", "holds"), [(0.0, slice(1, None)), (2.0, slice(None, -1))])
 def test_a_reading_that_holds_before_or_after_its_row_lags_by_the_share_of_each_gap(between, holds):
     x, tau, expected = _reading(_T), 0.4, [_reading(_T[0])]

@@ -30,6 +30,14 @@ def _chance(way, speed=_SPEED, **more):
     return chance_of_sorted_readings(simulator, table_for(simulator, {"speed": speed, "way": way, **columns}))
 
 
+def test_the_chance_is_that_of_one_arrangement_of_each_group_or_its_reverse():
+    way = _sorted_within(_SPEED)
+    assert _chance(way) == pytest.approx(2 / math.factorial(4) ** 12)
+    assert _chance(way[::-1], _SPEED[::-1]) == pytest.approx(2 / math.factorial(4) ** 12)
+    tied = np.repeat([[1.0, 1.0, 2.0, 3.0]], 12, axis=0).ravel()
+    assert _chance(tied) == pytest.approx(2 / (math.factorial(4) / 2) ** 12)
+
+
 def test_rows_are_equal_whatever_the_last_digits_of_their_columns():
     last_digits = np.where(np.arange(48) % 3 == 0, np.nextafter(_SPEED, np.inf), _SPEED)
     assert _chance(_sorted_within(_SPEED), last_digits) == pytest.approx(2 / math.factorial(4) ** 12)
@@ -89,3 +97,13 @@ def test_only_a_column_that_drives_the_simulator_sorts_a_table_without_a_time():
     assert sorting_column(_prepared(_X[::-1]).apparatus.about) == "x"
     assert sorting_column(_prepared(_RNG.permutation(_X), number=number).apparatus.about) is None
     assert sorting_column(_prepared(time="t", t=number).apparatus.about) is None
+
+
+def test_a_jump_of_a_sorted_table_shows_in_the_column_and_says_so():
+    prepared = _prepared()
+    step = prepared.effects["offset_step"]
+    assert step.covariates == ("x", "row")
+    assert (
+        "rows are sorted by x: what jumps or wanders from row to row may change with x instead"
+        in prepared.recording.notes
+    )

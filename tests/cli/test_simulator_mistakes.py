@@ -156,6 +156,10 @@ LAWS = {
         law_whose_rates('return {"temp_c": -1.0 if s["temp_c"] > 0 else 1.0}'),
         "allowed: np.where(condition, a, b) in place of if",
     ),
+    "a state far faster than the rows": (
+        law_whose_rates('return {"temp_c": 1e15 * (p["gain"] - s["temp_c"])}'),
+        "in each row somewhere in the prior, or for a state far faster than the rows its equilibrium",
+    ),
     "another reading": (
         f'{HEADER}states = {{"warm": 0.0}}\ndef rates(s, p, u):\n    return {{"warm": -s["warm"] / p["tau_s"]}}\n'
         'def observe(s, p, u):\n    return s["hot"]\n',

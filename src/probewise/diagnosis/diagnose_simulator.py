@@ -412,7 +412,10 @@ def without_unpredictable_readings(system: System, recording: RunRecording, *, e
     wrong = np.flatnonzero((unpredictable if every_row else lost) & ~missing)
     if wrong.size:
         where = f"no finite reading in {len(wrong)} of {len(table)} rows, first in row {wrong[0] + table.first_line}"
-        allowed = "a finite reading in each row somewhere in the prior, or a table without these rows"
+        way_out = (
+            "a table without these rows" if law is None else "for a state far faster than the rows its equilibrium"
+        )
+        allowed = f"a finite reading in each row somewhere in the prior, or {way_out}"
         raise ParameterError("simulate" if law is None else "rates", where, allowed)
     filled = table.with_columns({name: table.interpolated_within_runs(inputs[name]) for name in with_gaps})
     recording = replace(recording, plan=cast(Plan, filled))

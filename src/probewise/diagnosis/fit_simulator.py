@@ -265,8 +265,8 @@ def _doubts(
     """Yield a note if parameters can be exchanged, if draws are few, and if all are far less likely than the mode."""
     if n_even > 1:
         yield (
-            f"{n_even} sets of parameters fit equally well, as where terms can be exchanged: the samples hold all, the "
-            "mode is the one nearest to the middle of the priors"
+            f"{n_even} sets of parameters fit equally well, as where terms can be exchanged or a parameter changes no "
+            "reading: the samples hold all, the mode is the one nearest to the middle of the priors"
         )
     if not is_settled:
         yield (

@@ -71,7 +71,11 @@ class Campaign(Generic[K]):
                 )
             before = read_campaign(path, misfit=self.misfit)
             if before.settings != settings:
-                raise FileError(path, "it belongs to a campaign with other settings", f"{settings}; or another file")
+                own = [n for n in {**before.settings, **settings} if before.settings.get(n) != settings.get(n)]
+                there, here = (", ".join(f"{n} {shown(of.get(n))}" for n in own) for of in (before.settings, settings))
+                raise FileError(
+                    path, f"it belongs to a campaign with {there}", f"{here}, as asked now; or another file"
+                )
             done = {key: before.results[key] for key in tasks if key in before.results}
             left = {key: task for key, task in tasks.items() if key not in done}
             with path.open("r+b", buffering=0) as file, results_as_tasks_end(self.work, left, executor) as ended:

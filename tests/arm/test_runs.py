@@ -138,7 +138,7 @@ def test_a_person_confirms_the_first_lowering_of_an_arm_that_nobody_fitted(
     status, said = run(capsys, *(files.get(word, word) for word in words), "--arm", "nxt:x")
     assert status == 2
     assert "the sensor may touch the table" in said
-    assert "The sensor should be 60 mm above the table; if so, and it may be lowered further, then press Enter" in said
+    assert "Check that the sensor is 60 mm above the table, and free to be lowered further, then press Enter" in said
     assert "nobody is there to press Enter" in said
     geometry = read_geometry(shipped_geometry_path())
     counts = [bricks["opened"][0].motors[joint.port].position for joint in geometry.joints]

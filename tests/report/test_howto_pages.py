@@ -12,10 +12,10 @@ from probewise.recordings import plan
 HOWTO = Path(__file__).parents[2] / "docs" / "howto"
 
 
-def names_after_running(page, containing=""):
+def names_after_running(page, containing="", without="\0"):
     blocks = re.findall(r"```python\n(.*?)```", (HOWTO / page).read_text(encoding="utf-8"), re.DOTALL)
-    names = {}
-    exec(compile("\n".join(block for block in blocks if containing in block), page, "exec"), names)
+    names, wanted = {}, (block for block in blocks if containing in block and without not in block)
+    exec(compile("\n".join(wanted), page, "exec"), names)
     return names
 
 
@@ -30,10 +30,21 @@ def test_the_page_on_any_instrument_runs_as_printed(capsys):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::probewise.errors.DoubtfulResultWarning")
 def test_the_page_runs_as_printed(capsys):
-    names = names_after_running("python.md")
+    names = names_after_running("python.md", without="pandas")
     assert names["calibration"].sensor.n_gaussians in (1, 2)
     assert names["diagnosis"].verdict in capsys.readouterr().out
     assert len(names["run"].readings) == 5
+
+
+@pytest.mark.slow
+def test_the_page_diagnoses_a_data_frame_as_printed(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("pandas")
+    monkeypatch.chdir(tmp_path)
+    names = names_after_running("python.md", "pandas")
+    assert names["diagnosis"].combination == ("loss_per_c",)
+    assert "loss_per_c.value" in names["repaired"].names
+    assert {"mean", "sd"} <= set(names["predicted"].columns)
+    assert "named" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("module", [pytest.param(verbs, marks=pytest.mark.slow), plan])

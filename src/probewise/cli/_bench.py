@@ -390,7 +390,7 @@ def confirm_lowering(chosen: ArmName, arm: Instrument, geometry: Geometry | None
 def confirm_each_step_down(arm: LegoArm) -> None:
     ask = prompter(arm)
     arm.first_down = lambda height_mm: ask(
-        f"the sensor should be {height_mm:.0f} mm above the table; if so, and it may be lowered further"
+        f"check that the sensor is {height_mm:.0f} mm above the table, and free to be lowered further"
     )
 
 

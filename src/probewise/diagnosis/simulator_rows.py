@@ -211,7 +211,7 @@ class SimulatorApparatus(Apparatus):
             run="run",
             next_plan="next.csv",
             model="repaired.json",
-            no_cure="more rows, or columns and runs that vary differently",
+            no_cure="more rows, or a run with other settings or in another order",
             covariates=covariates,
             own_names=frozenset({own.reading, *self.about.table.columns, *own.parameters, *self.about.states}),
             units={"time": own.time_unit, "level": "{reading}", "previous": "{reading}"},

@@ -102,9 +102,6 @@ def draw_views(searches: Mapping[str, Exploration], n: int) -> AxesGrid:
         if np.isfinite(step.map.image[np.ix_(rows, columns)]).all():
             for patch in ax.patches:  # no place out of reach is in this part
                 patch.set_label("")
-    most = max(ax.images[0].get_clim()[1] for ax in axes[0])
-    for ax in axes[0]:  # one scale, to compare
-        ax.images[0].set_clim(0.0, most)
     draw_field_legend(axes)
     return axes
 

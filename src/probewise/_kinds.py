@@ -7,7 +7,6 @@ import math
 import os
 import re
 import sys
-import warnings
 from collections.abc import Mapping, Sequence
 from numbers import Integral, Real
 from pathlib import Path
@@ -16,7 +15,7 @@ from typing import TypeGuard
 import numpy as np
 from numpy.typing import NDArray
 
-from probewise.errors import ParameterError, UnitWarning, did_you_mean, require
+from probewise.errors import ParameterError, UnitWarning, did_you_mean, require, warn
 
 _FULL_TURN_RAD = math.tau * (1 + 1e-9)
 _MOST = 10_000_000  # of anything that is counted: more fill the memory
@@ -98,7 +97,7 @@ def warn_of_likely_degrees(name: str, values: float | NDArray[np.float64]) -> No
     widest = abs(values) if isinstance(values, float) else float(np.abs(values).max(initial=0.0))
     if _FULL_TURN_RAD < widest < math.inf:
         said = f"{name} reaches {widest:.6g} rad, beyond a full turn (6.283 rad): convert degrees with numpy.radians"
-        warnings.warn(said, UnitWarning, stacklevel=3)
+        warn(said, UnitWarning)
 
 
 def require_flag(name: str, value: object) -> None:

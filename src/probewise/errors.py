@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+import warnings
 from collections.abc import Iterable
 from functools import partial
 
@@ -52,6 +54,14 @@ def shown(value: object, most: int = _LONGEST_VALUE) -> str:
     except Exception:  # of a user's own __repr__
         return f"a {type(value).__name__}"
     return shortened(text, most)
+
+
+def warn(message: str, category: type[Warning]) -> None:
+    """Warn at the line of the caller's program that called this package."""
+    frame, level = sys._getframe(1), 2
+    while frame.f_back is not None and str(frame.f_globals.get("__name__")).partition(".")[0] == "probewise":
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, category, stacklevel=level)
 
 
 def message_of(error: BaseException, *, kind: bool = True) -> str:

@@ -94,6 +94,14 @@ def test_an_inquiry_is_settled_when_every_sd_is_reached():
     assert 2 < len(asked.readings) < 20
 
 
+def test_no_more_readings_than_parameters_settle_nothing():
+    asked = inquiry(goal={"slope": 10.0})
+    for _ in range(3):
+        assert not asked.settled
+        asked.tell(line({"slope": 0.5, "offset": 1.0}, asked.next()))
+    assert asked.settled
+
+
 def test_seconds_count():
     """Twice the information at the far end is not worth ten times the seconds; travel counts from the last setting."""
     assert inquiry(cost_s=[1, 1, 1, 1, 10.0]).next() == 1.5

@@ -154,6 +154,7 @@ BAD_TABLES = {
     "empty": ("", ["the file is empty"]),
     "open quote": (HEAD + '0,0,"1\n', ["row", "CSV"]),
     "not UTF-8": (HEAD.encode() + b"0,0,1\n0,0,\xff\n", ["row 3", "0xff", "UTF-8"]),
+    "a workbook": (b"PK\x03\x04\x14\x00", ["workbook", "CSV UTF-8"]),
     "UTF-16 without its mark": ((HEAD + "0,0,1\n").encode("utf-16-le"), ["row 1", "NUL", "UTF-16", "UTF-8"]),
     "half of UTF-16": (HEAD.encode("utf-16")[:-1], ["row", "is not UTF-16", "UTF-8"]),
     "two sessions": ("session," + HEAD + "0,0,0,1\n1,0,0,1\n", ["row 3", "column session", "throughout a scan"]),

@@ -340,3 +340,12 @@ def test_a_covariate_of_few_values_has_points_with_bars_and_no_line():
         assert means
         assert all(line.get_linestyle() == "None" for line in means)
         assert ax.containers
+
+
+def test_the_autocorrelation_of_interleaved_runs_is_that_of_each():
+    runs = np.random.default_rng(2).standard_normal((2, 40)).cumsum(axis=1)
+    apart, mixed = (
+        plots.residual_autocorrelation(values, scan).get_lines()[-1].get_ydata()
+        for values, scan in ((runs.ravel(), np.repeat([0, 1], 40)), (runs.T.ravel(), np.tile([0, 1], 40)))
+    )
+    np.testing.assert_allclose(mixed, apart)

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 import probewise
 from probewise._display import ShowsItself
 from probewise.cli import main
-from probewise.errors import ParameterError
+from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.nested import run
 from probewise.priors import Product, Uniform
 from probewise.recordings import Recording, paper_plan, shipped, write_recording
@@ -95,7 +95,9 @@ def test_tables_come_out_as_data_frames(monkeypatch):
     assert few.probability_of("nonlinearity") >= few.probability_of(("nonlinearity",)) > 0
     audit = probewise.audit(table, simulator=ramp)
     assert audit.to_frame()["effect"] == [effect.name for effect in audit.effects]
-    planned = probewise.predict(fit, {"x": [7.0, 8.0]}, rng=rng, progress=False)
+    with pytest.warns(DoubtfulResultWarning) as caught:
+        planned = probewise.predict(fit, {"x": [7.0, np.nan]}, rng=rng, progress=False)
+    assert caught[0].filename == __file__  # the line of the caller, not of the package
     assert "data:image/png;base64" in planned._repr_html_()
     found = run(Bell(), rng=np.random.default_rng(0), n_live=50).to_frame()
     assert list(found) == ["weight", "log_likelihood", "x_mm", "y_mm"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
@@ -28,7 +27,7 @@ from probewise.calibration.paper import OrderPosterior, ProblemsByOrder, Progres
 from probewise.calibration.priors import SSFPrior, blind_axis_rad, default_prior, scan_geometry
 from probewise.calibration.quick import fit_orders_quickly
 from probewise.calibration.sensor_file import FittedSensor, OrderEvidence
-from probewise.errors import DoubtfulResultWarning, ParameterError, require
+from probewise.errors import DoubtfulResultWarning, ParameterError, require, warn
 from probewise.inference import sd_ceiling, sd_floor
 from probewise.nested import NestedResult, StopRule, Weighted, least_live
 from probewise.recordings import Recording, fingerprint
@@ -225,7 +224,7 @@ def _fit_order(
     notes: tuple[str, ...] = ()
     if n_usable < len(prior.names):
         notes = (f"{n_usable} usable readings for {len(prior.names)} parameters: the result depends on the prior",)
-        warnings.warn(notes[0], DoubtfulResultWarning, stacklevel=3)
+        warn(notes[0], DoubtfulResultWarning)
     if found is None:
         found = search(n_gaussians, rng)
     notes, result = (*notes, *why, *found.notes), found.result

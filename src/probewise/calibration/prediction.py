@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -11,7 +10,7 @@ from probewise._arrays import FloatArray, floats, own_arithmetic
 from probewise.calibration.sensor_file import FittedSensor, require_fitted_sensor
 from probewise.effects import EFFECTS, Origin
 from probewise.effects.noise_distribution import PredictiveMixture
-from probewise.errors import DoubtfulResultWarning, ShapeError, require
+from probewise.errors import DoubtfulResultWarning, ShapeError, require, warn
 from probewise.progress import Progress, silent
 from probewise.recordings import Plan, Prediction, Recording
 from probewise.recordings.plan import require_patterns_described, require_plan
@@ -75,7 +74,7 @@ def predict(
     if recorded.shape != (len(plan),):
         raise ShapeError(f"readings have shape {recorded.shape}; allowed: ({len(plan)},), one per row of the plan")
     for doubt in _doubts(sensor, plan):
-        warnings.warn(doubt, DoubtfulResultWarning, stacklevel=2)
+        warn(doubt, DoubtfulResultWarning)
     scored = Recording(plan, recorded).usable
     step = sensor.instrumentation.step if plan.instrumentation.step is None else plan.instrumentation.step
     chain = sensor.chain(KnownScene(plan.patterns))

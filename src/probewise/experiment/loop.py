@@ -21,7 +21,7 @@ from probewise._kinds import checked_path, checked_whole, require_kind, require_
 from probewise.arm.carry_out import covariates_with_height
 from probewise.arm.instrument import Instrument, Pose, Reading
 from probewise.arm.own import Measures, as_instrument, require_measures
-from probewise.errors import DoubtfulResultWarning, FileError, LinkError, ParameterError, shown
+from probewise.errors import DoubtfulResultWarning, FileError, LinkError, ParameterError, shown, warn
 from probewise.experiment.inquire import (
     ArmReachAndTravel,
     inquire,
@@ -277,7 +277,7 @@ def _yield_steps(
     state = begin(experiment, instrument, rng=_rng_of_reading(seed, 0))
     doubt = _doubt_about_height(experiment, getattr(instrument, "read_height_mm", None))
     if doubt is not None:
-        warnings.warn(doubt, DoubtfulResultWarning, stacklevel=2)
+        warn(doubt, DoubtfulResultWarning)
     opened: contextlib.AbstractContextManager[JournalWriter | None] = contextlib.nullcontext()
     if before is not None:
         opened = JournalWriter.resume(before)
@@ -295,7 +295,7 @@ def _yield_steps(
                 writer.write_reading(number, reading)
             height_mm = covariates_with_height(reading).get("height_mm")  # NaN: missing
             if doubt is None and (doubt := _doubt_about_height(experiment, height_mm)) is not None:
-                warnings.warn(doubt, DoubtfulResultWarning, stacklevel=2)
+                warn(doubt, DoubtfulResultWarning)
             state, info = step(
                 state,
                 reading,

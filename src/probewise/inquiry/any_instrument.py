@@ -431,10 +431,11 @@ class Inquiry(ShowsItself):
     def settled(self) -> bool:
         """Whether the posterior sd of every parameter in the goal is at most its goal.
 
-        Raises ParameterError if the inquiry has no goal.
+        Not before there are more readings than parameters: fewer fit any model, and none could be doubted. Raises
+        ParameterError if the inquiry has no goal.
         """
         require(self._goal, "goal", None, 'posterior sds by parameter, such as {"centre_hz": 0.5}')
-        return self._largest_sd_over_goal <= 1.0
+        return len(self._taken) > len(self._model.prior.names) and self._largest_sd_over_goal <= 1.0
 
     @property
     @own_arithmetic

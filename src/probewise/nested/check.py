@@ -340,8 +340,8 @@ class _SecondEstimate:
             return [
                 f"{self.name} gives log Z = {self.run.log_z:.2f} ± {self.run.log_z_error:.2f}, this run "
                 f"{run.log_z:.2f} ± {run.log_z_error:.2f}: {abs(self.distance(run)):.1f} errors apart; chains are too "
-                "short or a part of the posterior was lost; use a greater steps_per_param, more n_live, or a greater "
-                "max_cost"
+                "short or a part of the posterior was lost; use move=nested.SliceMove(steps_per_param=4), more n_live, "
+                "or a greater max_cost"
             ]
         return [f"{self.name}, which checks the evidence, is itself doubtful: {w}" for w in self.run.warnings[:1]]
 

@@ -273,5 +273,5 @@ def warning_of_few_lineages(memory: float) -> str | None:
         return None
     return (
         f"memory is {memory:.0f}: so few lineages lead to the posterior that the error is itself uncertain; "
-        "use more steps_per_param or more n_live"
+        "use move=nested.SliceMove(steps_per_param=4) or more n_live"
     )

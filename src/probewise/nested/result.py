@@ -11,7 +11,6 @@ import io
 import json
 import math
 import platform
-import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -36,6 +35,7 @@ from probewise.errors import (
     message_of,
     require,
     shown,
+    warn,
 )
 from probewise.nested.evidence import DOUBTFUL_P_VALUE, birth_rows, integrate, log_volumes, n_independent
 from probewise.nested.weights import resampled_rows, weighted_quantiles
@@ -407,7 +407,7 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
     if p_value < DOUBTFUL_P_VALUE:
         doubts.append(f"insertion ranks of the runs together are not uniform (p = {p_value:.1g})")
     for doubt in doubts:
-        warnings.warn(doubt, DoubtfulResultWarning, stacklevel=2)
+        warn(doubt, DoubtfulResultWarning)
     inherited = [f"run {i} of {len(parts)}: {note}" for i, r in enumerate(parts, start=1) for note in r.warnings]
     return NestedResult(
         names=parts[0].names,

@@ -12,7 +12,6 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
@@ -32,7 +31,7 @@ from probewise._kinds import (
     require_like,
     require_rng,
 )
-from probewise.errors import DoubtfulResultWarning, NotConvergedError, ParameterError, require
+from probewise.errors import DoubtfulResultWarning, NotConvergedError, ParameterError, require, warn
 from probewise.nested.check import check_and_repeat
 from probewise.nested.evidence import (
     DOUBTFUL_P_VALUE,
@@ -234,7 +233,7 @@ def run(
             note = "interrupted while a second estimate checked the evidence"
             result = replace(result, warnings=(*result.warnings, note))
     for note in result.warnings:
-        warnings.warn(note, DoubtfulResultWarning, stacklevel=2)
+        warn(note, DoubtfulResultWarning)
     return result
 
 
@@ -493,7 +492,7 @@ def _final_result(
     if p_value < DOUBTFUL_P_VALUE:
         doubts.append(
             f"insertion ranks are not uniform (p = {p_value:.1g}): chains are too short or a mode was lost; "
-            "use more steps_per_param or more n_live"
+            "use move=nested.SliceMove(steps_per_param=4) or more n_live"
         )
     doubts.append(warning_of_few_lineages(remembered))
     if not evaluate.names:

@@ -6,7 +6,6 @@ import contextlib
 import re
 import tempfile
 import time
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
@@ -16,7 +15,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise._writing import write_bytes_atomically
-from probewise.errors import FileError, NotSavedWarning, ParameterError
+from probewise.errors import FileError, NotSavedWarning, ParameterError, warn
 from probewise.nested.moves import Move
 from probewise.nested.problem import Evaluator, Points
 from probewise.nested.result import archive_bytes, read_archive
@@ -131,7 +130,7 @@ class CheckpointFile:
             write_bytes_atomically(self.path, archive_bytes(head, arrays))
             self._state_in_file = now
         except FileError as error:
-            warnings.warn(f"{error}; the run goes on unsaved", NotSavedWarning, stacklevel=2)
+            warn(f"{error}; the run goes on unsaved", NotSavedWarning)
         finally:
             self._last_saving = time.monotonic()
             self._saving_time_s = self._last_saving - begun

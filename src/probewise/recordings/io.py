@@ -25,7 +25,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise._kinds import checked_path
-from probewise.errors import FileError, ParameterError, PipeWarning, message_of, require, shortened, shown
+from probewise.errors import FileError, ParameterError, PipeWarning, message_of, require, shortened, shown, warn
 
 T = TypeVar("T")
 
@@ -38,7 +38,7 @@ def read_bytes(path: Path, what: str) -> bytes:
     try:
         device = path.is_char_device() or path.is_block_device()  # /dev/zero never ends
         if path.is_fifo():
-            warnings.warn(f"{path} is a pipe: reading it waits for its writer to end", PipeWarning, stacklevel=2)
+            warn(f"{path} is a pipe: reading it waits for its writer to end", PipeWarning)
         content = b"" if device else path.read_bytes()
     except FileNotFoundError as error:
         raise FileError(path, "there is no such file", what) from error
@@ -49,7 +49,8 @@ def read_bytes(path: Path, what: str) -> bytes:
     return content
 
 
-_AS_UTF_8 = "UTF-8 text (save the file again with that encoding)"
+_AS_UTF_8 = "UTF-8 text (save the file again with that encoding; from a spreadsheet program as CSV UTF-8)"
+_ZIP = b"PK\x03\x04"  # a workbook is a zip archive
 
 
 def read_text(path: Path, what: str) -> str:
@@ -58,6 +59,10 @@ def read_text(path: Path, what: str) -> str:
     Raises FileError if it is missing, cannot be read or is no such text.
     """
     content = read_bytes(path, what)
+    if content.startswith(_ZIP):
+        raise FileError(
+            path, "it is a workbook of a spreadsheet program or a zip archive", "a table saved as CSV UTF-8"
+        )
     wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     try:
         text = content.decode("utf-16" if wide else "utf-8-sig")

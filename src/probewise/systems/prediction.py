@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
@@ -18,7 +17,7 @@ from probewise._words import count_with_noun
 from probewise.effects import EFFECTS, Effect
 from probewise.effects.noise import dropouts, noise_of_runs, noise_per_run, random_walk
 from probewise.effects.noise_distribution import PredictiveMixture, RecordedBefore
-from probewise.errors import DoubtfulResultWarning, ParameterError, require
+from probewise.errors import DoubtfulResultWarning, ParameterError, require, warn
 from probewise.progress import Progress, silent
 from probewise.recordings import Instrumentation, write_text_atomically
 from probewise.recordings.files import prediction_summary
@@ -184,14 +183,14 @@ def predict_system(
         raise ParameterError("simulate" if system.caller else "rates", found, allowed)
     if n_failed:
         left_out = f"{n_failed} of {n_samples} samples are left out: the simulator gives no finite readings for them"
-        warnings.warn(left_out, DoubtfulResultWarning, stacklevel=2)
+        warn(left_out, DoubtfulResultWarning)
     mean, sd, scores = mixture.mean_sd_and_log_density()
     if lost.any():
         mean, sd = np.where(lost, np.nan, mean), np.where(lost, np.nan, sd)
         first_lost = int(np.argmax(lost)) + own.first_line
         rows = f"{count_with_noun(int(lost.sum()), 'row')} cannot be predicted, first row {first_lost}"
         why = "a number that they need is missing; where an effect looks back to it, it is interpolated"
-        warnings.warn(f"{rows}: {why}", DoubtfulResultWarning, stacklevel=2)
+        warn(f"{rows}: {why}", DoubtfulResultWarning)
     notes = (*own.notes, *_note_on_runs_started_again(fitted, own))
     counts = {"n_samples": n_samples, "n_failed": n_failed}
     return SystemPrediction(own, recording.readings, mean=mean, sd=sd, log_density=scores, notes=notes, **counts)

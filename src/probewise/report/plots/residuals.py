@@ -208,6 +208,8 @@ def residual_autocorrelation(
     `scan` holds scan numbers, (n_points,). Powers of `rho`, the estimated correlation of neighbours, are drawn too.
     """
     ax = canvas.axes_or_new(ax)
+    in_order = np.argsort(scan, kind="stable")  # runs may be interleaved
+    residuals, scan = residuals[in_order], scan[in_order]
     lags = np.arange(1, min(_MOST_LAGS, max(len(residuals) // 4, 1)) + 1)
     variance = float(np.nanmean(residuals**2)) or 1.0
     correlation, chance = np.full(len(lags), np.nan), np.full(len(lags), np.nan)

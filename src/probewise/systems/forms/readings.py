@@ -45,6 +45,7 @@ _SMOOTH = "smooth"  # name of the parameter that distinguishes the variants of a
 _ODDS_OF_VARIANTS = 1.0, 0.05, 0.5
 _APART = 1.0  # lambda from the first variant at some trial size, below which another one is the same
 _BEND_DEGREE = 4
+_NEAR_LOW = 0.05  # of the range: below it a power less than one may have any slope
 _COEFFICIENTS = "a1", "a2", "a3", "a4", "a5"  # of a curve
 _HARDLY = 1e-6  # of a size: more than rounding of none
 
@@ -329,6 +330,12 @@ def _nonlinearity_form(about: ReferenceFit) -> Iterator[Effect]:
     @acting
     def act(value: FloatArray, rows: RunTable, a: FloatArray, power: FloatArray) -> FloatArray:
         share = (value - low) / (high - low)
+        # Limited so that the response rises from near the low end on: what falls again is no bend of a meter.
+        ends = power * np.concatenate([np.full_like(power, _NEAR_LOW), np.ones_like(power)], axis=1) ** (power - 1) - 1
+        with np.errstate(divide="ignore"):
+            limits = -1 / ends
+        most = np.min(np.where(ends < 0, limits, np.inf), axis=1, keepdims=True)
+        a = np.clip(a, np.max(np.where(ends > 0, limits, -np.inf), axis=1, keepdims=True), most)
         return value + a * (high - low) * (np.sign(share) * np.abs(share) ** power - share)
 
     z = f"z from 0 at {low:.4g} to 1 at {high:.4g} {about.reading_unit}"

@@ -26,6 +26,21 @@ def test_the_paper_plan_is_the_papers():
     np.testing.assert_allclose(np.diff(plan.time_s[rows[0]]), 1.2)
 
 
+def test_the_two_way_plan_goes_both_ways_in_every_orientation():
+    plan = two_way_plan()
+    assert len(plan) == 961
+    for deg in (0, 90, 180, 270):
+        out, back = (plan.rows_by_scan()[plan.scan_names.index(f"edge_{deg}_{way}")] for way in ("out", "back"))
+        np.testing.assert_array_equal(plan.x_mm[out], plan.x_mm[back][::-1])
+        assert plan.direction_of_motion[out[0], 0] == 1
+        assert plan.direction_of_motion[back[0], 0] == -1
+        fast = 2 if deg >= 180 else 1
+        np.testing.assert_allclose(np.diff(plan.time_s[out])[0], fast * np.diff(plan.time_s[back])[0])
+    assert set(plan.pattern_names) >= {"white", "black", "disc"}
+    np.testing.assert_array_equal(plan.direction_of_motion[-1], [0, -1])
+    assert np.all(np.diff(plan.time_s) > 0)
+
+
 def test_jitter_keeps_the_order_and_the_pace():
     plan = two_way_plan()
     taken = with_jittered_times(plan, rng=np.random.default_rng(1))

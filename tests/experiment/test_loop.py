@@ -387,6 +387,5 @@ def test_a_run_that_went_on_to_check_its_sensor_says_both(found):
     steps = [replace(step, checks_sensor=k >= len(whole.steps) - 3) for k, step in enumerate(whole.steps)]
     steps[-1] = replace(steps[-1], checks_sensor=False)
     assert replace(whole, steps=tuple(steps)).stop_reason == (
-        "every length is known to better than 4 mm; 2 readings were taken with that known, to check what the sensor "
-        "model may leave out"
+        "every length is known to better than 4 mm; 2 readings only checked what the sensor model may leave out"
     )

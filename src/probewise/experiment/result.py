@@ -144,8 +144,7 @@ def stop_reason_with_checks(steps: Sequence[Step]) -> str | None:
     reason, n = steps[-1].stop_reason, sum(step.checks_sensor for step in steps)
     if reason is None or n == 0:
         return reason
-    taken = f"{count_with_noun(n, 'reading')} {'was' if n == 1 else 'were'} taken"
-    return f"{reason}; {taken} with that known, to check what the sensor model may leave out"
+    return f"{reason}; {count_with_noun(n, 'reading')} only checked what the sensor model may leave out"
 
 
 @dataclass(frozen=True, eq=False)

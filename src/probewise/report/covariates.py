@@ -215,7 +215,7 @@ def views_of_place(diagnosis: Diagnosis, place: Place) -> list[CovariateView]:
     label = axis_label(diagnosis, place.covariate, place.scan)
     if place.without_effect:
         unit = unit_after_number(diagnosis.recording.plan.instrumentation.unit)
-        label = f"reading to be expected without it ({unit})"
+        label = f"predicted reading without the effect ({unit})"
     window = None if place.start is None or place.end is None else (place.start, place.end)
     draw, said = time_without_gaps(diagnosis.recording.plan, place.covariate)
     at, label = draw(at), label + said

@@ -180,16 +180,17 @@ def recorded_against_predicted(
     Where nothing was read, the predictions are drawn row by row. `label` and `unit` are those of the readings.
     """
     there = np.isfinite(readings)
+    label += "" if f"[{unit}]" in label else f" ({unit})"
     if not there.any():
         ax = canvas.axes_or_new(ax)
         ax.errorbar(np.arange(len(predicted)), predicted, yerr=_SD_95 * sd, fmt="o", ms=3, lw=0.8, color=canvas.BLUE)
-        return canvas.finish(ax, x="row, from 0", y=f"predicted {label} ({unit}), 95 %", plain="y")
+        return canvas.finish(ax, x="row, from 0", y=f"predicted {label}, 95 %", plain="y")
     ax = canvas.axes_or_new(ax, size_in=(canvas.PANEL_IN, 4.2))
     x, y = predicted[there], readings[there]
     ax.errorbar(x, y, yerr=sd[there], fmt="o", ms=3, lw=0.8, color=canvas.BLUE, alpha=0.6, label="readings, ± 1 sd")
     ends = [min(x.min(), y.min()), max(x.max(), y.max())]
     ax.plot(ends, ends, color=canvas.BLACK, lw=0.9, label="as predicted")
-    return canvas.finish(ax, x=f"predicted {label} ({unit})", y=f"recorded {label} ({unit})", plain=None)
+    return canvas.finish(ax, x=f"predicted {label}", y=f"recorded {label}", plain=None)
 
 
 def _draw_dots(ax: Axes, x: FloatArray, y: FloatArray, colour: str, label: str) -> None:

@@ -302,12 +302,10 @@ def before_and_after_caption(diagnosis: Diagnosis) -> str:
 
 
 def _before_and_after_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> Sequence[str]:
-    against = "All residuals against time and against predicted reading, with running means."
     curves = [effect for effect in diagnosis.effects if figure_name_of(effect.name) in drawn]
     return (
         html.figure(drawn["before_after.svg"], before_and_after_caption(diagnosis)),
         *_parameter_elements(diagnosis),
-        html.figure(drawn["residuals.svg"], against),
         *(
             html.figure(drawn[figure_name_of(e.name)], _as_sentence(diagnosis, f"With the 95 % band: {e.sentence}"))
             for e in curves

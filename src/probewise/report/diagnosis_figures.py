@@ -10,7 +10,6 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from probewise._arrays import FloatArray, IntArray
-from probewise._words import unit_after_number
 from probewise.diagnosis import Diagnosis, Place
 from probewise.diagnosis.locate import figure_name_of
 from probewise.diagnosis.words import hypothesis_in_words
@@ -21,7 +20,6 @@ from probewise.report.covariates import (
     axis_label,
     is_scan_along_line,
     noise_of,
-    time_without_gaps,
     view_along_scan,
     views_of_place,
 )
@@ -40,7 +38,6 @@ def figure_drawers(diagnosis: Diagnosis) -> dict[str, Callable[[], bytes]]:
     drawers: dict[str, Callable[[], bytes]] = {
         "first.svg": lambda: svg(draw_first_figure(diagnosis)),
         "before_after.svg": lambda: svg(before_and_after(diagnosis)),
-        "residuals.svg": lambda: _all_residuals_svg(diagnosis),
         "noise.svg": lambda: _noise_tests_svg(diagnosis),
     }
     gain = diagnosis.improvement
@@ -163,19 +160,6 @@ def rows_of_scan_changed_most(plan: Plan | RunTable, change: FloatArray) -> IntA
     scans = [rows for rows in plan.rows_by_scan() if rows.size]
     lines = [rows for rows in scans if is_scan_along_line(plan, rows)]
     return max(lines or scans, key=lambda rows: (float(change[rows] @ change[rows]), rows.size))
-
-
-def _all_residuals_svg(diagnosis: Diagnosis) -> bytes:
-    """Draw all residuals against time and predicted reading: before the repair, and after it if it changes them."""
-    plan = diagnosis.recording.plan
-    unrepaired = diagnosis.apparatus.words.before_in_words
-    models = [(unrepaired, diagnosis.before.residuals), (diagnosis.after_in_words, diagnosis.after.residuals)]
-    models = models if diagnosis.repair_changes_predictions else models[:1]
-    time = axis_label(diagnosis, "row" if isinstance(plan, RunTable) and not plan.has_varying_time else "time")
-    draw, said = time_without_gaps(plan, "time")
-    covariates = ((time + said, draw(plan.time_s)), (axis_label(diagnosis, "level"), diagnosis.before.readings))
-    unit = unit_after_number(plan.instrumentation.unit)
-    return svg(plots.residuals_against_covariates(covariates, models, unit=unit))
 
 
 def _noise_tests_svg(diagnosis: Diagnosis) -> bytes:

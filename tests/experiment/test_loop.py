@@ -4,6 +4,7 @@ import math
 import runpy
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from exploring import ChainArm, run
 
 from probewise.arm.instrument import Pose, Reading
 from probewise.errors import FileError, ParameterError
-from probewise.experiment import arm_over, begin, explore, inquire, loop, read_journal, step
+from probewise.experiment import Exploration, arm_over, begin, explore, inquire, loop, read_journal, step
 from probewise.experiment.judgement import is_target_reached, p_value_and_worst_reading
 from probewise.experiment.paper import OneScan
 from probewise.inference import GaussianKnown, StudentT
@@ -389,3 +390,11 @@ def test_a_run_that_went_on_to_check_its_sensor_says_both(found):
     assert replace(whole, steps=tuple(steps)).stop_reason == (
         "every length is known to better than 4 mm; 2 readings only checked what the sensor model may leave out"
     )
+
+
+@pytest.mark.parametrize(("doubt_p", "p_value", "n_notes"), [(0.0, 1e-9, 2), (0.0, 0.2, 1), (1e-6, 1e-9, 1)])
+def test_a_coarse_model_that_nothing_fits_says_so(doubt_p, p_value, n_notes):
+    run = SimpleNamespace(
+        last=SimpleNamespace(p_value=p_value, notes=("a",)), experiment=SimpleNamespace(doubt_p=doubt_p)
+    )
+    assert len(Exploration.notes.fget(run)) == n_notes

@@ -214,8 +214,12 @@ class Exploration(Reported):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Warnings on the last step."""
-        return self.last.notes
+        """Warnings on the last step; of a coarse model, whose fit ends no run, that nothing it can be fits."""
+        p_value = self.last.p_value
+        if self.experiment.doubt_p > 0 or p_value is None or p_value >= Experiment.doubt_p:
+            return self.last.notes
+        said = f"no hypothesis explains the readings (p = {p_value:.1g}): this coarse model has too small sds"
+        return (*self.last.notes, said)
 
     def recording(self, *, instrumentation: Instrumentation | None = None) -> Recording:
         """Convert the readings to a recording over the pattern "field", with a sensor's `instrumentation`."""

@@ -35,7 +35,7 @@ def test_what_a_file_holds_is_not_done_again(file_of):
 
 
 def test_another_version_s_cases_are_not_mixed_in(file_of):
-    with pytest.raises(FileError, match="other settings"):
+    with pytest.raises(FileError, match=r"a campaign with challenge '0\.0'"):
         challenge([0], seed=3).run(path=file_of([case()], version="0.0"))
 
 

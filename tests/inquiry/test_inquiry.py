@@ -100,6 +100,7 @@ def test_no_more_readings_than_parameters_settle_nothing():
         assert not asked.settled
         asked.tell(line({"slope": 0.5, "offset": 1.0}, asked.next()))
     assert asked.settled
+    assert "data:image/png;base64" in asked._repr_html_()
 
 
 def test_seconds_count():

@@ -15,6 +15,7 @@ from probewise.calibration import Calibration, FittedSensor
 from probewise.diagnosis import Diagnosis, PlanAudit, SystemFit
 from probewise.errors import ParameterError
 from probewise.experiment import Exploration
+from probewise.inquiry import Inquiry
 from probewise.investigation import Investigation
 from probewise.nested.result import Samples
 from probewise.recordings import Prediction, Recording
@@ -57,6 +58,10 @@ _DRAWINGS: dict[type, tuple[Callable[[Any], Axes | AxesGrid], str]] = {
     RunRecording: (readings_in_order, "Readings in the order of the rows."),
     Prediction: (_draw_predicted, "Predicted readings, each with its 95 % band."),
     Samples: (lambda value: corner_plot(value, parameters=value.names[:_MOST_PARAMETERS]), _POSTERIOR),
+    Inquiry: (
+        lambda value: corner_plot(value.posterior, parameters=value.posterior.names[:_MOST_PARAMETERS]),
+        _POSTERIOR,
+    ),
     Exploration: (exploration.draw_last_view, "The robot's view at the end."),
     Diagnosis: (draw_first_figure, "Residuals, and probabilities of explanations."),
     SystemFit: (fit.draw_recorded_against_predicted, _ON_THE_LINE),

@@ -84,7 +84,7 @@ class World:
         `surface`: the surface below; `x_mm`, `y_mm`, `orientation_rad`: commanded pose, lab frame; `time_s`: time of
         the reading; `rng`: generator of the noise; None: a reading without noise, but rounded; `direction`: unit vector
         of the motion to this pose, for backlash and hysteresis; (0, 0): none; `height_mm`: commanded height of the
-        sensor; None: `self.height_mm`.
+        sensor; None: `self.height_mm`. An effect that looks back to earlier readings, such as a lag, does not act.
         """
         if rng is not None:
             require_rng(rng)

@@ -8,7 +8,6 @@ import math
 import sys
 import time
 import traceback
-import warnings
 from collections.abc import Callable, Iterator, Mapping
 from numbers import Real
 from pathlib import Path
@@ -24,7 +23,7 @@ from probewise._signals import defer_signals
 from probewise.arm.instrument import Clock, Instrument, Pose, Reading
 from probewise.arm.lego import LegoArm
 from probewise.arm.simulated import SimulatedArm, Speed
-from probewise.errors import FileError, LinkError, ParameterError, ShapeError, message_of, require
+from probewise.errors import FileError, LinkError, ParameterError, ShapeError, message_of, require, warn
 from probewise.recordings.columns import KNOWN, SESSION
 from probewise.recordings.io import LARGEST, in_this_directory, run_python_file
 from probewise.recordings.table import LARGEST_PLACE_MM
@@ -110,8 +109,9 @@ class OwnInstrument:
         except Exception as failure:
             if error is None:
                 raise
-            warnings.warn(
-                f"the instrument may not be at rest: {message_of(failure, kind=False)}", RuntimeWarning, stacklevel=2
+            warn(
+                f"the instrument may not be at rest: {message_of(failure, kind=False)}",
+                RuntimeWarning,
             )
 
     @property

@@ -545,9 +545,8 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     own = cast(RunTable, as_recording(simulator, inputs).plan)
     system = System.of(simulator, own)
     z, predicted, where = _point_where_readings_vary(system, own)
-    columns = simulator.inputs(own.covariates)  # that only effects read, since every row is predicted
-    gaps = [name for name, values in columns.items() if 0 < np.isfinite(values).sum() < len(values)]
-    own = own.with_columns({name: own.interpolated_within_runs(columns[name]) for name in gaps})
+    filled = simulator.interpolated_inputs(own)  # columns that only effects read, since every row is predicted
+    own = own.with_columns(filled)
     sd, noise = _noise_sd_and_source(simulator, own, predicted)
     system = with_converged_step(system, own, system.theta(z[None, :]), tolerance=STANDS_STILL * sd)
     about = ReferenceFit(system, own.with_columns({simulator.reading: predicted}), z, sd)
@@ -561,7 +560,7 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     reasons = _reasons_for_absence(about)
     names = dict.fromkeys([*forms, *(name for name in reasons if name not in forms), *on_noise])
     assumed = f"{simulator.source or 'the simulator'} at {where}, noise {sd:.3g} {simulator.unit} ({noise})"
-    assumed += f"; gaps of {join_lists(gaps)} are interpolated" if gaps else ""
+    assumed += f"; gaps of {join_lists([*filled])} are interpolated" if filled else ""
     expected = Expected(cast(Null, system), z, sd, lambda _: built, assumed)
     bank = expected.bank(cast(Plan, own), most=_SETTINGS_OF_TABLE)
     rows = np.arange(len(own))

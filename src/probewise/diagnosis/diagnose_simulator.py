@@ -400,10 +400,10 @@ def without_unpredictable_readings(system: System, recording: RunRecording, *, e
     unpredictable = ~there[there.any(axis=1)].any(axis=0) if there.any() else np.ones(len(table), dtype=np.bool_)
     lost = unpredictable & recording.usable
     inputs, missing = system.simulator.inputs(table.covariates), np.zeros(len(table), dtype=np.bool_)
-    with_gaps = [name for name, values in inputs.items() if 0 < np.isfinite(values).sum() < len(values)]
+    filled = system.simulator.interpolated_inputs(table)
     for values in inputs.values():
         missing |= ~np.isfinite(values)
-    if not unpredictable.any() and not (every_row and with_gaps):
+    if not unpredictable.any() and not (every_row and filled):
         return recording
     gaps = np.flatnonzero(missing)
     if law is not None:  # what is missing once is missing to the end of its run
@@ -417,9 +417,8 @@ def without_unpredictable_readings(system: System, recording: RunRecording, *, e
         )
         allowed = f"a finite reading in each row somewhere in the prior, or {way_out}"
         raise ParameterError("simulate" if law is None else "rates", where, allowed)
-    filled = table.with_columns({name: table.interpolated_within_runs(inputs[name]) for name in with_gaps})
-    recording = replace(recording, plan=cast(Plan, filled))
-    for name in with_gaps if every_row else ():
+    recording = replace(recording, plan=cast(Plan, table.with_columns(filled)))
+    for name in filled if every_row else ():
         beside = recording.usable & ~lost & ~np.isfinite(inputs[name])
         if 0 < beside.sum() <= _MOST_WITHOUT_COLUMN * recording.usable.sum():
             readings = count_with_noun(int(beside.sum()), "reading")

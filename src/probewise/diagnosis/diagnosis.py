@@ -293,8 +293,12 @@ class Diagnosis(Judged, Reported):
 
     def to_frame(self) -> Any:
         """Return a pandas DataFrame of the explanations: `effects`, `words` and `probability`, a row each."""
-        told = [("+".join(h.effects), hypothesis_in_words(h.effects), h.probability) for h in self.hypotheses]
-        return data_frame(dict(zip(("effects", "words", "probability"), zip(*told, strict=True), strict=True)))
+        columns = {
+            "effects": ["+".join(h.effects) for h in self.hypotheses],
+            "words": [hypothesis_in_words(h.effects) for h in self.hypotheses],
+            "probability": [h.probability for h in self.hypotheses],
+        }
+        return data_frame(columns)
 
     def summary(self) -> str:
         """Describe the diagnosis in plain text."""

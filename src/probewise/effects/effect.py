@@ -98,9 +98,6 @@ class Binding:
     source: Callable[[], Effect] | None = None
 
 
-UNBOUND = Binding()
-
-
 @dataclass(frozen=True, eq=False)
 class Effect:
     """An effect, bound to a recording and perhaps to a target.
@@ -145,7 +142,7 @@ class Effect:
     alternatives: tuple[Effect, ...] = ()
     expression: str = ""
     needs_rising_time: bool = False
-    binding: Binding = UNBOUND
+    binding: Binding = Binding()
 
     has_change_point: ClassVar[bool] = False
     """Whether its variants are the intervals of a change point."""

@@ -47,6 +47,10 @@ def _draw_predicted(value: Prediction) -> AxesGrid:
     return predicted_and_recorded_by_scan(Recording(value.plan, readings), value.mean, value.sd)
 
 
+def _draw_posterior(value: Samples) -> AxesGrid:
+    return corner_plot(value, parameters=value.names[:_MOST_PARAMETERS])
+
+
 _SSF = "Spatial sensitivity function, seen from above; white lines at a half and a tenth of its peak."
 _ON_THE_LINE = "Recorded against predicted readings; on the line they agree."
 _POSTERIOR = f"Posterior of up to {_MOST_PARAMETERS} parameters: each by itself, and each pair."
@@ -57,11 +61,8 @@ _DRAWINGS: dict[type, tuple[Callable[[Any], Axes | AxesGrid], str]] = {
     Recording: (readings_by_orientation, "Readings along the scans."),
     RunRecording: (readings_in_order, "Readings in the order of the rows."),
     Prediction: (_draw_predicted, "Predicted readings, each with its 95 % band."),
-    Samples: (lambda value: corner_plot(value, parameters=value.names[:_MOST_PARAMETERS]), _POSTERIOR),
-    Inquiry: (
-        lambda value: corner_plot(value.posterior, parameters=value.posterior.names[:_MOST_PARAMETERS]),
-        _POSTERIOR,
-    ),
+    Samples: (_draw_posterior, _POSTERIOR),
+    Inquiry: (lambda value: _draw_posterior(value.posterior), _POSTERIOR),
     Exploration: (exploration.draw_last_view, "The robot's view at the end."),
     Diagnosis: (draw_first_figure, "Residuals, and probabilities of explanations."),
     SystemFit: (fit.draw_recorded_against_predicted, _ON_THE_LINE),

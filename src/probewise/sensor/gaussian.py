@@ -9,7 +9,6 @@ Gaussian of the SSF over the region. The other, the paper's sum over pixels, is
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache, lru_cache, singledispatch
@@ -18,7 +17,7 @@ import numpy as np
 from scipy.special import ndtr, ndtri, owens_t
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.errors import ParameterError, SlowWarning
+from probewise.errors import ParameterError, SlowWarning, warn
 from probewise.scene.regions import (
     EllipseRegion,
     HalfPlaneRegion,
@@ -154,11 +153,10 @@ def mean_albedo_under_one_gaussian(region: Region, gaussian: LabGaussian, n_node
     A region without a registered closed form is seen at 4,181 places: error about 1e-3, and a `SlowWarning` is issued.
     """
     kind = type(region).__name__
-    warnings.warn(
+    warn(
         f"{kind} has no closed form: each footprint over it is summed over places, in milliseconds; register one with "
         f"probewise.sensor.gaussian.mean_albedo_under_one_gaussian.register({kind})",
         SlowWarning,
-        stacklevel=2,
     )
     shape = np.broadcast_shapes(gaussian.shape, (region.n_regions, 1))
     out, number = np.empty(shape), np.arange(_N_PLACES)

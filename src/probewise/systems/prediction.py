@@ -147,7 +147,7 @@ def predict_system(
     whole, recorded = _with_recorded_rows_before(fitted, own)
     before = len(recorded)
     system = replace(
-        System.of(fitted.simulator, whole.with_columns(_interpolated_inputs(fitted.simulator, whole))),
+        System.of(fitted.simulator, whole.with_columns(fitted.simulator.interpolated_inputs(whole))),
         max_step=fitted.max_step,
         stiff=fitted.stiff,
         limited=False,  # noise decides which readings are at an end of the range
@@ -304,7 +304,7 @@ def _filled_table_and_mask(chain: SystemChain, theta: FloatArray, table: RunTabl
     gives none, as a law from there to the end of the run. Raises ParameterError if no row can be predicted.
     """
     few, lost, needed = theta[:_FEW], np.zeros(len(table), dtype=np.bool_), list[str]()
-    filled = _interpolated_inputs(chain.system.simulator, table)
+    filled = chain.system.simulator.interpolated_inputs(table)
     whole, bare = table.with_columns(filled), chain.system.chain(table, ())
     if not filled or not np.isfinite(chain.predict(few, whole)).any():
         return table, lost
@@ -318,11 +318,6 @@ def _filled_table_and_mask(chain: SystemChain, theta: FloatArray, table: RunTabl
         row = int(np.argmax(~np.isfinite(table.covariates[needed[0]]))) + table.first_line
         raise ParameterError(f"column {needed[0]!r}", f"no number in row {row}", "a number where a prediction needs it")
     return table.with_columns({name: filled[name] for name in needed}), lost
-
-
-def _interpolated_inputs(simulator: Simulator, table: RunTable) -> dict[str, FloatArray]:
-    columns = simulator.inputs(table.covariates).items()
-    return {name: table.interpolated_within_runs(v) for name, v in columns if not np.isfinite(v).all()}
 
 
 def _bound_effects(fitted: FittedSystem, table: RunTable) -> list[Effect]:

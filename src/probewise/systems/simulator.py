@@ -252,6 +252,11 @@ class Simulator:
         """Return columns by name without the reading and its declared sd."""
         return {name: values for name, values in columns.items() if name not in (self.reading, self.noise.sd)}
 
+    def interpolated_inputs(self, table: RunTable) -> dict[str, NDArray[Any]]:
+        """Return the columns of numbers that have gaps, by name, each interpolated within runs."""
+        inputs = self.inputs(table.covariates).items()
+        return {n: table.interpolated_within_runs(v) for n, v in inputs if 0 < np.isfinite(v).sum() < len(v)}
+
 
 def table_for(simulator: Simulator, data: RunTable | Mapping[str, Any]) -> RunTable:
     """Build a simulator's table from columns by name (a dict of arrays, a DataFrame); return a RunTable as it is."""

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import time
-import warnings
 from collections.abc import Iterator, Sequence
 from functools import partial
 from types import TracebackType
@@ -19,7 +18,7 @@ from probewise.arm.instrument import Clock, Side
 from probewise.arm.nxt import telegram as nxt
 from probewise.arm.nxt.link import Link, SerialPort
 from probewise.arm.nxt.motor import Guard, Motor
-from probewise.errors import LinkError, LowBatteryWarning, require
+from probewise.errors import LinkError, LowBatteryWarning, require, warn
 
 AD_MAX = 1023
 N_INVALID = 3  # least number of attempts, since one may use up the allowed time on a slow connection
@@ -186,11 +185,10 @@ class Brick:
             )
         if self._last_mv < LOW_MV and not self._told_low:
             self._told_low = True
-            warnings.warn(
+            warn(
                 f"the NXT's battery is at {self._last_mv / 1000:.2f} V, below {LOW_MV / 1000:g} V: motors slow down, "
                 "and the brick may switch itself off; change or charge it",
                 LowBatteryWarning,
-                stacklevel=2,
             )
         return self._last_mv
 

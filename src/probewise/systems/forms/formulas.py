@@ -97,9 +97,12 @@ def formula_forms(about: ReferenceFit) -> Iterator[Effect]:
     yield from _forms_of_terms(about, [*_terms_of(centred), *shapes], look_up, (about.predicted, table))
     for name in columns:
         yield from _threshold_form(about, name)
+    # What adds up along rows that a column sorts is a function of that column.
+    adds_up = bool(in_time) or (about.rows_are_in_order and sorting_column(about) is None)
     for name, values in columns.items():
         yield from _varying_influence_form(about, name, values)
-        yield from _dose_forms(about, name, values)
+        if adds_up:
+            yield from _dose_forms(about, name, values)
     if in_time:
         yield from _fading_gain_form(about)
         yield from _square_wave_form(about)
@@ -372,8 +375,6 @@ def _varying_influence_form(about: ReferenceFit, name: str, values: FloatArray) 
 def _dose_forms(about: ReferenceFit, name: str, values: FloatArray) -> Iterator[Effect]:
     """Yield changes of the reading that saturate with a dose: the integral of |column - mean|, or |column|."""
     table, centre, in_time = about.table, _rounded_mean(values), about.table.has_varying_time
-    if not in_time and (not about.rows_are_in_order or sorting_column(about) is not None):
-        return  # what adds up along sorted rows is a function of the column that sorts them
     origins = {f"|{name} - {text_rounded_to_spread(centre, float(np.std(values)))}|": centre}
     if values.min() >= 0 or values.max() <= 0:
         origins[f"|{name}|"] = 0.0

@@ -86,10 +86,11 @@ def _late_form(about: ReferenceFit, name: str, act: Act, tried: FloatArray, says
         given = (name, Stage.LAG, own, ("previous",), act, words, bank)
         variants += about.form(*given, absent={0: 0.0}, needs_rising_time=True)
     first, *others = (act(about.predicted[None, :], each.entries[:, 0], about.table) for each in variants)
-    apart = [
-        np.sqrt(np.nansum((first - other)[:, about.has_reading] ** 2, axis=1).max()) / about.sd for other in others
-    ]
-    told = (variant for variant, by in zip(variants[1:], apart, strict=True) if by > _APART)
+    told = (
+        variant
+        for variant, other in zip(variants[1:], others, strict=True)
+        if np.sqrt(np.nansum((first - other)[:, about.has_reading] ** 2, axis=1).max()) / about.sd > _APART
+    )
     yield replace(variants[0], alternatives=tuple(told))
 
 
@@ -331,7 +332,7 @@ def _nonlinearity_form(about: ReferenceFit) -> Iterator[Effect]:
     def act(value: FloatArray, rows: RunTable, a: FloatArray, power: FloatArray) -> FloatArray:
         share = (value - low) / (high - low)
         # Limited so that the response rises from near the low end on: what falls again is no bend of a meter.
-        ends = power * np.concatenate([np.full_like(power, _NEAR_LOW), np.ones_like(power)], axis=1) ** (power - 1) - 1
+        ends = power * np.array([_NEAR_LOW, 1.0]) ** (power - 1) - 1
         with np.errstate(divide="ignore"):
             limits = -1 / ends
         most = np.min(np.where(ends < 0, limits, np.inf), axis=1, keepdims=True)

@@ -322,27 +322,27 @@ class SimulatedRecorder:
         yield from readings_of_recording(self.world.simulate(plan, rng=rng))[len(taken) :]
 
 
-def parse_concealed(text: str) -> tuple[Concealed, ...]:
+def parse_concealed(text: str, option: str = "--truth") -> tuple[Concealed, ...]:
     """Parse concealed effects: NAME:VALUE,VALUE, several joined by +, or "nothing" for none.
 
-    ParameterError if an effect is unknown, or its values are too few, too many, or no numbers up to 1e9.
+    ParameterError, of `option`, if an effect is unknown, or its values are too few, too many, or no numbers up to 1e9.
     """
-    return () if text == NOTHING else tuple(_parse_one_effect(part) for part in text.split("+"))
+    return () if text == NOTHING else tuple(_parse_one_effect(part, option) for part in text.split("+"))
 
 
-def _parse_one_effect(text: str) -> Concealed:
+def _parse_one_effect(text: str, option: str) -> Concealed:
     name, _, numbers = text.partition(":")
     names_of = {own: inspect.signature(kind).parameters for own, kind in KINDS.items()}
     kinds = {own for own, taken in names_of.items() if {each.annotation for each in taken.values()} == {"float"}}
     if name not in kinds:
         allowed = f"{NOTHING}, or an effect of probewise.world.concealed with its values{did_you_mean(name, kinds)}"
-        raise ParameterError("--truth", name, allowed)
+        raise ParameterError(option, name, allowed)
     allowed = f"{name}:{','.join(names_of[name])}, all of them numbers of magnitude up to {_LARGEST:g}"
     try:
         values = [float(number) for number in numbers.split(",")]
         effect: Concealed = KINDS[name](*values)
     except (TypeError, ValueError) as error:
-        raise ParameterError("--truth", text, allowed) from error
+        raise ParameterError(option, text, allowed) from error
     if not all(abs(value) <= _LARGEST for value in values):  # nor NaN
-        raise ParameterError("--truth", text, allowed)
+        raise ParameterError(option, text, allowed)
     return effect

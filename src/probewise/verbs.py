@@ -189,6 +189,7 @@ def explore(
     *,
     shape: str | Sequence[str] | Shape = SHAPE,
     truth: Truth | None = None,
+    conceal: str | None = None,
     arm: Instrument | Measures | None = None,
     field: scene.Field | None = None,
     model: ModelName = MODEL,
@@ -225,6 +226,9 @@ def explore(
         Hidden parameters of the (first) shape on the simulated field, for a circle (x_mm, y_mm, radius_mm) or
         {"x_mm": 600, "y_mm": 260, "radius_mm": 90}; or {"rectangle": ...}, by name. By default drawn from the shape's
         prior.
+    conceal
+        Effects of the simulated world that the sensor model leaves out, such as "backlash:8" (mm), or
+        "saturation:40+lag:2": kinds of `probewise.world.concealed`, each with its numbers; None: none.
     arm
         The instrument, used as a context manager; by default the simulated arm. Your own needs only a method
         `measure(pose)` that returns a number or a dict; see `probewise.arm.as_instrument`. Of a `LegoArm` whose
@@ -273,7 +277,7 @@ def explore(
     """
     from dataclasses import replace
 
-    from probewise import _kinds, experiment
+    from probewise import _kinds, experiment, investigation
     from probewise._progress import progress_or_bar
     from probewise.arm import LegoArm, as_instrument
     from probewise.calibration.sensor_file import require_fitted_sensor
@@ -326,12 +330,14 @@ def explore(
     taken = () if before is None else before.readings
     if arm is None:
         hidden = experiment.HiddenShape.given_or_drawn(truth, asked.shape, field, rng=streams.truth)
-        about["hidden"] = hidden.journal_entry
-        world, scale = experiment.world_like(sensor), experiment.scale_of(sensor.instrumentation)
+        about |= {"hidden": hidden.journal_entry, **({"concealed": conceal} if conceal else {})}
+        effects = investigation.parse_concealed(conceal or investigation.NOTHING, "conceal")
+        world, scale = experiment.world_like(sensor, effects), experiment.scale_of(sensor.instrumentation)
         surface = experiment.with_cards(hidden.surface, asked.cards)
         arm = experiment.arm_over(world, surface, field, seed=streams.noise, taken=taken, scale=scale)
-    elif truth is not None:
-        raise ParameterError("truth", truth, "none with an arm of your own: what lies there is for it to find")
+    elif truth is not None or conceal is not None:
+        name, given = ("conceal", conceal) if truth is None else ("truth", truth)
+        raise ParameterError(name, given, "none with an arm of your own: what lies there is for it to find")
     instrument = as_instrument(arm, start_s=taken[-1].time_s if taken else 0.0, name="arm")
     steps: list[Step] = []
     with instrument, progress_or_bar(progress) as told:
@@ -350,7 +356,7 @@ def explore(
                 continue
             believed = f"widest sd {step.largest_sd_mm:.1f} mm, {step.bits:.1f} bits"
             told(f"reading {step.number} of at most {max_readings}", note=believed)
-        return experiment.Exploration(asked, tuple(steps), hidden, sensor)
+        return experiment.Exploration(asked, tuple(steps), hidden, sensor, conceal or "")
 
 
 def naive_levels(sensor: FittedSensor, levels: Recording | None, *, rng: np.random.Generator) -> Naive:

@@ -38,6 +38,14 @@ def test_a_simulated_arm_that_lacks_the_effects_of_its_sensor_says_so(explore, s
     assert "but not its effects: gain drift" in capsys.readouterr().out
 
 
+def test_what_the_world_conceals_is_in_the_journal_and_the_summary(explore, capsys):
+    assert explore("--conceal", "gain:-0.5", "--max-readings", 1)[1][0]["concealed"] == "gain:-0.5"
+    said = capsys.readouterr().out
+    assert "concealed    gain:-0.5" in said
+    assert "sensor       The sensor model leaves nothing out that shows" in said
+    assert explore("--max-readings", 1, "--resume")[0] == 2  # without what it conceals
+
+
 @pytest.mark.slow
 def test_the_sensor_may_be_learnt_along(explore, capsys):
     status, lines = explore("--learn-sensor", "--max-readings", 1)

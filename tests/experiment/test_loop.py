@@ -23,6 +23,7 @@ from probewise.scene import AnyOf, Circle, Field, Rectangle
 from probewise.scene.scenes import HypothesisScene
 from probewise.sensor import Chain, FixedLevels, FixedMixture
 from probewise.world import Blob, World, gaussian_spot
+from probewise.world.concealed import backlash, correlated_noise, lag
 
 COARSE = Grid(400.0, 300.0, 14, 10)
 
@@ -94,7 +95,8 @@ def test_one_seed_gives_one_run_and_two_runs_of_a_generator_differ(small):
 
 def test_a_simulated_run_resumed_at_any_reading_writes_the_journal_of_one_never_interrupted(small, tmp_path):
     """Its clock shows the way from the place of the last reading, its noise is that of the next."""
-    surface, world = Disc((250.0, 140.0), 60.0), World(gaussian_spot([Blob(1.0, (0.0, 0.0), (8.0, 8.0))]))
+    surface, concealed = Disc((250.0, 140.0), 60.0), (backlash(9.0), lag(3.0), correlated_noise(0.7))
+    world = World(gaussian_spot([Blob(1.0, (0.0, 0.0), (8.0, 8.0))]), concealed=concealed)
     experiment = small.experiment(grid=COARSE, n_particles=200)
 
     def simulated(journal, taken=()):

@@ -7,7 +7,7 @@ import pytest
 
 from probewise.errors import ParameterError
 from probewise.recordings import HalfPlane, Uniform, paper_plan, two_way_plan
-from probewise.world import Blob, World, gaussian_spot
+from probewise.world import Blob, Reader, World, gaussian_spot
 from probewise.world import concealed as known
 from probewise.world.stages import acts_at
 
@@ -48,6 +48,16 @@ def test_one_reading_by_one_gives_the_same_as_the_whole_plan(clean):
             direction=tuple(PLAN.direction_of_motion[k]),
         )
         assert alone == pytest.approx(together[k], abs=1e-9)
+
+
+def test_a_reader_remembers_its_way_and_its_readings():
+    plan = PLAN.take(np.arange(40))
+    effects = world(known.backlash(1.0), known.hysteresis(2.0), known.lag(1.0), noise_sd=0.0)
+    surface, reader = plan.patterns[plan.pattern_names[plan.pattern[0]]], Reader(effects, seed=(1,))
+    rows = zip(plan.x_mm, plan.y_mm, plan.orientation_rad, plan.time_s, strict=True)
+    alone = [reader.read(surface, x, y, turn, time_s=time_s) for x, y, turn, time_s in rows]
+    together = effects.expected_readings(plan)
+    np.testing.assert_allclose(alone[20:], together[20:], atol=1e-6)  # of its first reading it knows no direction
 
 
 def test_readings_are_rounded_to_the_step():

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import itertools
 import math
 import queue
 import sys
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-import numpy as np
 from tqdm import tqdm
 
 from probewise import emulator, recordings
@@ -40,6 +38,7 @@ from probewise.cli._common import CommandError, print_result, print_warning, say
 from probewise.cli._options import ARMS, SCENE, parse_finite_numbers, parse_place, refuse_options
 from probewise.errors import ParameterError, did_you_mean, require
 from probewise.verbs import DEFAULT_SEED
+from probewise.world import Reader
 
 if TYPE_CHECKING:
     from probewise.world import Surface, World
@@ -111,14 +110,14 @@ def open_arm(
     seed: int = DEFAULT_SEED,
     start_s: float = 0.0,
     n_taken: int = 0,
-    last: Reading | None = None,
+    taken: Sequence[Reading] = (),
 ) -> Opened:
     """Open an arm; return it with its simulated bench, None for a real arm.
 
     A user's instrument is connected when it is entered. An emulated arm is built as its name says, or as the file
-    `built`; a simulated one has this `reach`, and starts at the pose of `last`. Both read with `light`, by default the
-    sensor of the shipped recordings, over `surface`, by default the usual target, with noise of this `seed`, after the
-    `n_taken` readings of an earlier session.
+    `built`; a simulated one has this `reach`, and starts at the last pose of `taken`. Both read with `light`, by
+    default the sensor of the shipped recordings, over `surface`, by default the usual target, with noise of this
+    `seed`, after the `n_taken` readings of an earlier session, or after those `taken` over this surface.
     """
     if chosen.kind == "file":
         return OwnInstrument.from_file(chosen.where, start_s=start_s), None
@@ -129,17 +128,18 @@ def open_arm(
     surface = emulator.parse_scene(SCENE) if surface is None else surface
     if chosen.is_lego:
         setting = (geometry, chosen.where or built, world, surface)
-        arm, bench = open_emulated_arm_and_bench(*setting, seed=seed + n_taken, start_s=start_s)
+        arm, bench = open_emulated_arm_and_bench(*setting, seed=seed + n_taken + len(taken), start_s=start_s)
         return arm, SimulatedBench(bench.table, bench.arm.sensor_pose)
-    table, number = emulator.Tabletop(surface), itertools.count(n_taken)
+    table, reader = emulator.Tabletop(surface), Reader(world, seed=(seed,), first=n_taken)
 
     def read_world(pose: Pose, time_s: float, height_mm: float) -> float:
-        rng = np.random.default_rng([seed, next(number)])
         place = (pose.x_mm, pose.y_mm, pose.orientation_rad)
-        return table.read(world, *place, time_s=time_s, rng=rng, height_mm=height_mm)
+        return table.read(reader, *place, time_s=time_s, height_mm=height_mm)
 
+    for earlier in taken:
+        read_world(earlier.pose, earlier.time_s, earlier.covariates.get("height_mm", world.height_mm))
     reach = reach or Reach()
-    last = last or Reading(math.nan, Pose(*reach.rest_mm), start_s)
+    last = taken[-1] if taken else Reading(math.nan, Pose(*reach.rest_mm), start_s)
     simulated = SimulatedArm(read_world, reach=reach, scale=scale, height_mm=world.height_mm, last=last)
     return simulated, SimulatedBench(table)
 

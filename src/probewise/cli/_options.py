@@ -274,6 +274,11 @@ def _explore(to: argparse.ArgumentParser) -> None:
     add(to, "--shape SHAPE", about, nargs="+", choices=SHAPES, default=[SHAPE])
     about = "the true shape in the simulated world, a circle as X,Y,R in mm (default: drawn from the seed)"
     add(to, "--truth [SHAPE:]V,V,...", about)
+    about = (
+        "an effect of the simulated world that the sensor model leaves out, such as backlash:8 (mm), saturation:40 or "
+        "albedo_gradient:-0.0003,0 (per mm); several are joined by +"
+    )
+    add(to, "--conceal NAME:V,V", about)
     add(to, "--field W,H", "width and height of the field in mm (default: the geometry's, or 1048,520)")
     add(to, "--arm ARM")
     about = f"{_GEOMETRY}; the simulated arm has its reach, and a sensor that turns with --orientations alone)"

@@ -29,6 +29,7 @@ from probewise.effects import spoken_name
 from probewise.errors import FileError, ParameterError, did_you_mean, require
 from probewise.experiment import Experiment, Exploration, HiddenShape, ModelName, Step, read_journal
 from probewise.inference import Naive
+from probewise.investigation import NOTHING, parse_concealed
 from probewise.progress import Progress
 from probewise.recordings import read_recording, shipped
 from probewise.report import exploration as report
@@ -95,7 +96,8 @@ def run(arguments: argparse.Namespace) -> int:
             else:
                 note = f"reading {step.number} of at most {arguments.max_readings}"
                 progress("exploring", note=f"{note}; widest sd {step.largest_sd_mm:.1f} mm")
-    result = Exploration(search.experiment, tuple(steps), sensor=search.sensor)
+    concealed = arguments.conceal or ""
+    result = Exploration(search.experiment, tuple(steps), sensor=search.sensor, concealed=concealed)
     with reporting_what_is_kept(kept_message, results=True), progress_of(arguments) as progress:
         search.write_results(result, progress=progress)
     lines = search.closing_lines(result, journal)
@@ -126,6 +128,7 @@ class Search:
         with_geometry = self.arm.is_lego or (arguments.geometry is not None and self.arm.kind != "file")
         self.geometry = read_or_shipped_geometry(arguments) if with_geometry else None
         _refuse_contradictions(arguments, self.arm, self.geometry)
+        self.concealed = parse_concealed(arguments.conceal or NOTHING, "--conceal")
         self.field = _checked_field(arguments.field, self.geometry)
         self.sensor = self._shipped_sensor() if arguments.sensor is None else read_sensor(arguments.sensor)
         if self.arm.is_lego and self.sensor.instrumentation.unit not in ("", "LEGO"):
@@ -198,19 +201,19 @@ class Search:
         hidden = parse_truth(arguments.truth, arguments.shape, self.field, rng=self.streams.truth)
         self.truth_mm = hidden.outline_mm
         self.known = hidden.parameters_by_hypothesis_name(self.experiment.names)
+        world = experiments.world_like(self.sensor, self.concealed)
         arm, _ = _bench.open_arm(
             self.arm,
             self.geometry,
             arguments.geometry,
-            (experiments.world_like(self.sensor), experiments.scale_of(self.sensor.instrumentation)),
+            (world, experiments.scale_of(self.sensor.instrumentation)),
             experiments.with_cards(hidden.surface, self.experiment.cards),
             reach=self.geometry or Reach((self.field.width_mm, self.field.height_mm)),
             seed=self.streams.noise,
             start_s=start_s,
-            n_taken=len(taken),
-            last=taken[-1] if taken else None,
+            taken=taken,
         )
-        return arm, {"hidden": hidden.journal_entry}
+        return arm, {"hidden": hidden.journal_entry, **({"concealed": arguments.conceal} if arguments.conceal else {})}
 
     @property
     def files(self) -> list[Path]:
@@ -285,11 +288,7 @@ class Search:
         effects = ", ".join(spoken_name(effect.name) for effect in self.sensor.effects_on_new_scans)
         if effects and not self.arm.is_real:
             yield f"note: the simulated arm has the sensor's SSF, levels and noise, but not its effects: {effects}"
-        trust = self.experiment.trust
-        missing = experiments.left_out_after_step(result.last, trust)
-        if trust < 1:
-            yield missing.sentence
-        if missing.leading != experiments.CLEAN:
+        if experiments.left_out_after_step(result.last, self.experiment.trust).leading != experiments.CLEAN:
             yield f"what the readings say of the sensor: probewise diagnose {journal} --out DIAGNOSIS"
         if self.known is not None:
             yield f"truth        {', '.join(f'{name} {value:.5g}' for name, value in self.known.items())}"
@@ -302,6 +301,8 @@ def _refuse_contradictions(arguments: argparse.Namespace, arm: _bench.ArmName, g
         refuse_options(arguments, "FILE.py, which defines its own reach", "geometry")
     if arm.is_real:
         refuse_options(arguments, "a real arm, whose target is unknown", "truth")
+    if arm.kind != "simulated":
+        refuse_options(arguments, "any arm but the simulated one", "conceal")
     if geometry is not None:
         refuse_options(arguments, "the LEGO arm, no joint of which turns its sensor", "orientations")
         if arguments.heights != (read_mm := geometry.read_height_mm,):

@@ -22,7 +22,7 @@ from probewise.emulator.radio import Faults, Radio, Trace, ignore_trace
 from probewise.errors import ParameterError
 from probewise.recordings import read_text
 from probewise.recordings.patterns import Disc, HalfPlane, Polygon, Quadrant, Uniform
-from probewise.world import Oval, Surface, World
+from probewise.world import Oval, Reader, Surface, World
 
 Numbers: TypeAlias = Mapping[str, Any]
 """The tables and entries of a geometry file, in mm and degrees; the shipped one explains each."""
@@ -182,7 +182,7 @@ class Tabletop:
     turned_rad: float = 0.0
     origin_mm: tuple[float, float] = (0.0, 0.0)
 
-    def read(self, world: World, x_mm: float, y_mm: float, turned_rad: float, **more: Any) -> float:
+    def read(self, world: World | Reader, x_mm: float, y_mm: float, turned_rad: float, **more: Any) -> float:
         """Read a world's sensor over the surface, at a place of the field; `more` as `World.read` takes it."""
         x0_mm, y0_mm = self.origin_mm
         return world.read(self.surface, x_mm - x0_mm, y_mm - y0_mm, turned_rad, **more)

@@ -149,12 +149,16 @@ def stop_reason_with_checks(steps: Sequence[Step]) -> str | None:
 
 @dataclass(frozen=True, eq=False)
 class Exploration(Reported):
-    """A whole run: its configuration and its steps; the true shape and the calibrated sensor, if they are known."""
+    """A whole run: its configuration and its steps; the true shape and the calibrated sensor, if they are known.
+
+    `concealed` are the effects of the simulated world that the sensor model leaves out, as they were given.
+    """
 
     experiment: Experiment
     steps: tuple[Step, ...]
     hidden: HiddenShape | None = None
     sensor: FittedSensor | None = None
+    concealed: str = ""
 
     @property
     def arm_error(self) -> ArmError | None:
@@ -239,6 +243,10 @@ class Exploration(Reported):
             if last.p_value is None
             else f"fit          p = {last.p_value:.2g} (how often a right hypothesis fits no better)",
         ]
+        if self.experiment.trust < 1:
+            lines.append(f"sensor       {left_out_after_step(last, self.experiment.trust).sentence}")
+        if self.concealed:
+            lines.append(f"concealed    {self.concealed}")
         if self.hidden is not None:
             lay = ", ".join(f"{name} {_number(name, value)}" for name, value in self.hidden.parameters.items())
             lines.append(f"hidden       {self.hidden.name}: {lay}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import itertools
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -19,7 +18,7 @@ from probewise.calibration import FittedSensor
 from probewise.calibration.sensor_file import require_fitted_sensor
 from probewise.errors import ParameterError, did_you_mean, printable, require
 from probewise.experiment.journal import value_digest
-from probewise.recordings import Disc, Instrumentation, Polygon
+from probewise.recordings import Disc, Instrumentation, Polygon, Uniform
 from probewise.scene import (
     SHAPES,
     AnyOf,
@@ -30,7 +29,7 @@ from probewise.scene import (
     outlines,
 )
 from probewise.scene.shapes import require_shape
-from probewise.world import CoveredSurface, Oval, Spot, Surface, World
+from probewise.world import Concealed, CoveredSurface, Oval, Reader, Spot, Surface, World
 
 ModelName: TypeAlias = Literal["ssf", "naive"]
 _USUAL_HEIGHT_MM = 14.0  # height of the paper's sensor above the surface
@@ -91,8 +90,11 @@ def scale_of(instrumentation: Instrumentation) -> ReadingScale:
     return ReadingScale(-math.inf if low is None else low, math.inf if high is None else high, instrumentation.step)
 
 
-def world_like(sensor: FittedSensor) -> World:
-    """Build the simulated world of a fitted sensor: its mean field as the footprint, its levels, noise and height."""
+def world_like(sensor: FittedSensor, concealed: tuple[Concealed, ...] = ()) -> World:
+    """Build the simulated world of a fitted sensor: its mean field as the footprint, its levels, noise and height.
+
+    ParameterError if it lacks a column that a `concealed` effect acts by, such as a battery's voltage.
+    """
     require_fitted_sensor(sensor)
     field, means = sensor.field, sensor.mean()
     corner = (field.origin_mm[0] - field.pixel_mm / 2, field.origin_mm[1] - field.pixel_mm / 2)
@@ -100,7 +102,9 @@ def world_like(sensor: FittedSensor) -> World:
     spot = Spot(np.maximum(field.values, 0.0), field.pixel_mm, corner)
     height_mm = sensor.instrumentation.height_mm or _USUAL_HEIGHT_MM
     noise_sd = float(sensor.noise_sd.mean())
-    return World(spot, black=means["I_min"], white=means["I_max"], noise_sd=noise_sd, height_mm=height_mm)
+    world = World(spot, means["I_min"], means["I_max"], noise_sd, concealed=concealed, height_mm=height_mm)
+    world.read(Uniform(0.5), 0.0, 0.0, time_s=0.0, rng=None, height_mm=height_mm)
+    return world
 
 
 def with_cards(surface: Surface, cards: Sequence[Card]) -> Surface:
@@ -128,13 +132,14 @@ def arm_over(
     one. `workspace` is the reach of the arm, by default `Reach` over the field; `scale` rounding and range of readings,
     by default the LEGO brick's.
     """
-    number = itertools.count(len(taken))
+    reader = Reader(world, seed=(seed,))
 
     def light(pose: Pose, time_s: float, height_mm: float) -> float:
-        rng = np.random.default_rng([seed, next(number)])
         place = (pose.x_mm, pose.y_mm, pose.orientation_rad)
-        return world.read(surface, *place, time_s=time_s, rng=rng, height_mm=height_mm)
+        return reader.read(surface, *place, time_s=time_s, height_mm=height_mm)
 
+    for earlier in taken:
+        light(earlier.pose, earlier.time_s, earlier.covariates.get("height_mm", world.height_mm))
     reach = Reach((field.width_mm, field.height_mm)) if workspace is None else workspace
     return SimulatedArm(
         light,

@@ -19,15 +19,15 @@ import numpy as np
 from probewise._arrays import FloatArray, own_arithmetic
 from probewise._kinds import checked_whole
 from probewise._version import __version__
-from probewise.arm import Pose, Reading, SimulatedArm, Speed
-from probewise.experiment import CLEAN, TRUST, Experiment, Exploration, left_out_after_step, recording_of
+from probewise.arm import Pose, SimulatedArm, Speed
+from probewise.experiment import CLEAN, TRUST, Experiment, Exploration, left_out_after_step
 from probewise.experiment.result import WRONG_MM
 from probewise.inference import Rounded
 from probewise.proof import study
 from probewise.proof.campaign import CONCEALED_TRIAL, Campaign, Estimate, Result, estimated_share, grouped, misfit
 from probewise.recordings.table import csv_text_of_rows
 from probewise.sensor import Chain
-from probewise.world import Blob, Concealed, World
+from probewise.world import Blob, Concealed, Reader, World
 from probewise.world import concealed as conceal
 
 _MIDDLE_MM = (study.FIELD.width_mm / 2, study.FIELD.height_mm / 2)
@@ -162,7 +162,6 @@ _IN_ARM_FRAME: Mapping[str, Callable[[float, FloatArray], FloatArray]] = {
     "position_scale": lambda share, circle: circle / (1.0 + share),
     "scale_of_x": lambda share, circle: circle / np.array([1.0 + share, 1.0, 1.0]),
 }
-_REMEMBERING = frozenset({"lag", "correlated_noise", "after_glow", "peak_memory"})  # readings depend on earlier ones
 
 
 @dataclass(frozen=True)
@@ -249,18 +248,10 @@ def _arm_in_concealed_world(trial: ConcealedTrial) -> SimulatedArm:
     noisy: Any = {"noise_sd": now.noise_sd, "step": now.step, "concealed": made if isinstance(made, tuple) else (made,)}
     world = World(study.footprint_pixels(now.blobs), black=study.DARK, white=study.BRIGHT, **noisy)
     disc = study.disc_of(trial.circle_mm)
-    came: list[tuple[Pose, float, tuple[float, float]]] = []
+    reader = Reader(world, seed=(trial.seed, trial.circle))
 
     def light_reading(pose: Pose, time_s: float, height_mm: float) -> float:
-        before, _, direction = came[-1] if came else (pose, 0.0, (0.0, 0.0))
-        if (away := math.hypot(pose.x_mm - before.x_mm, pose.y_mm - before.y_mm)) > 0:
-            direction = ((pose.x_mm - before.x_mm) / away, (pose.y_mm - before.y_mm) / away)
-        came.append((pose, time_s, direction))
-        if trial.effect in _REMEMBERING:
-            so_far = recording_of([Reading(0.0, was, at_s) for was, at_s, _ in came], patterns={"field": disc}).plan
-            return float(world.simulate(so_far, rng=np.random.default_rng([trial.seed, trial.circle])).readings[-1])
-        rng = np.random.default_rng([trial.seed, trial.circle, len(came) - 1])
-        return world.read(disc, pose.x_mm, pose.y_mm, pose.orientation_rad, time_s=time_s, rng=rng, direction=direction)
+        return reader.read(disc, pose.x_mm, pose.y_mm, pose.orientation_rad, time_s=time_s)
 
     return study.arm_that_reads(light_reading, speed=Speed(500.0, now.each_s - _MOVE_S))
 

@@ -342,6 +342,7 @@ def _facts(run: Exploration, model: str, seed: int | None) -> dict[str, str]:
         "sensor model": model,
         "inference": run.experiment.inference_method.label,
         "stopped because": run.stop_reason,
+        **({"concealed in the simulated world": run.concealed} if run.concealed else {}),
         "cost": f"{count_with_noun(len(run.steps), 'reading')}, {number_text(run.seconds, 0)} s of arm time",
         "information": f"{number_text(run.last.bits, 1)} bits, {number_text(run.bits_per_reading, 2)} per reading",
         **({"the paper's count": paper} if run.target_reached else {}),

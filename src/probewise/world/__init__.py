@@ -8,13 +8,14 @@ from probewise.world.concealed import saturation
 from probewise.world.spots import Blob, Spot, gaussian_spot, raster_spot, ridge_spot, ring_spot, tailed_spot
 from probewise.world.stages import Concealed
 from probewise.world.surfaces import CoveredSurface, Oval, Surface, albedo_at, seen_white_fraction
-from probewise.world.world import World
+from probewise.world.world import Reader, World
 
 __all__ = [
     "Blob",
     "Concealed",
     "CoveredSurface",
     "Oval",
+    "Reader",
     "Spot",
     "Surface",
     "World",

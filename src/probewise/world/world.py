@@ -84,10 +84,25 @@ class World:
         `surface`: the surface below; `x_mm`, `y_mm`, `orientation_rad`: commanded pose, lab frame; `time_s`: time of
         the reading; `rng`: generator of the noise; None: a reading without noise, but rounded; `direction`: unit vector
         of the motion to this pose, for backlash and hysteresis; (0, 0): none; `height_mm`: commanded height of the
-        sensor; None: `self.height_mm`. An effect that looks back to earlier readings, such as a lag, does not act.
+        sensor; None: `self.height_mm`. An effect that looks back to earlier readings, such as a lag, does not act; it
+        does with `Reader`.
         """
         if rng is not None:
             require_rng(rng)
+        view = self.view_from_pose(surface, x_mm, y_mm, orientation_rad, time_s, direction, height_mm)
+        return float(self._recorded_readings(view, rng)[0])
+
+    def view_from_pose(
+        self,
+        surface: Surface,
+        x_mm: float,
+        y_mm: float,
+        orientation_rad: float,
+        time_s: float,
+        direction: tuple[float, float],
+        height_mm: float | None,
+    ) -> View:
+        """Compute what the sensor sees from one pose; parameters as for `read`."""
         rows = Rows(
             place_mm=np.array([[x_mm, y_mm]]),
             direction=np.array([direction]),
@@ -99,8 +114,7 @@ class World:
             across=np.array([common_edge_normal(surface)]),
             edge_mm=distance_to_nearest_edge(surface, np.array([x_mm]), np.array([y_mm])),
         )
-        view = self._view_of_rows([(surface, np.zeros(1, dtype=np.int64))], rows)
-        return float(self._recorded_readings(view, rng)[0])
+        return self._view_of_rows([(surface, np.zeros(1, dtype=np.int64))], rows)
 
     def view(self, plan: Plan, surfaces: Mapping[str, Surface] | None = None) -> View:
         """Compute what the sensor sees at each reading of a plan, by integrating light: a simulation's costly part.
@@ -191,11 +205,17 @@ class World:
         dimming = sent.commanded_column("led", otherwise=1.0) * scale**-2.0
         return View(self._with_effects("seen", seen, there), dimming, there)
 
-    def _recorded_readings(self, view: View, rng: np.random.Generator | None) -> FloatArray:
-        """Turn a view into readings with noise, rounding and losses; if `rng` is None, with rounding only."""
+    def _recorded_readings(
+        self, view: View, rng: np.random.Generator | None, white: FloatArray | None = None
+    ) -> FloatArray:
+        """Turn a view into readings with noise, rounding and losses; if `rng` is None, with rounding only.
+
+        `white`: standard normal draws, which become the noise, (n_points,); None: they are drawn from `rng` too.
+        """
         readings = self.noise_free_readings(view)
         if rng is not None:
-            noise = self._with_effects("noise", rng.standard_normal(len(readings)), view.rows, view.seen, rng)
+            white = rng.standard_normal(len(readings)) if white is None else white
+            noise = self._with_effects("noise", white, view.rows, view.seen, rng)
             readings = readings + self.noise_sd * noise
         readings = self._with_effects("quantisation", readings, view.rows)
         if self.step is not None:
@@ -215,3 +235,53 @@ class World:
         for name, _ in rows_by_pattern:
             require(name in known, "pattern", name, f"one of {', '.join(known) or 'none'}, or give it in surfaces")
         return [(known[name], rows) for name, rows in rows_by_pattern]
+
+
+class Reader:
+    """A world that is read place after place: effects of the way there and of earlier readings act.
+
+    The noise of the k-th reading is by the seed (*`seed`, k), with k from `first`.
+    """
+
+    def __init__(self, world: World, *, seed: Sequence[int], first: int = 0) -> None:
+        self._world, self._seed, self._first = world, tuple(seed), first
+        self._views: View | None = None  # of all readings
+        self._white = np.empty(0)
+        self._last_mm, self._direction = np.empty(0), (0.0, 0.0)
+
+    def read(
+        self,
+        surface: Surface,
+        x_mm: float,
+        y_mm: float,
+        orientation_rad: float = 0.0,
+        *,
+        time_s: float,
+        height_mm: float | None = None,
+    ) -> float:
+        """Take the next reading; parameters as for `World.read`."""
+        place_mm = np.array([x_mm, y_mm])
+        way_mm = place_mm - self._last_mm if self._last_mm.size else np.zeros(2)
+        if (length_mm := float(np.hypot(*way_mm))) > 0:
+            self._direction = (float(way_mm[0]) / length_mm, float(way_mm[1]) / length_mm)
+        here = self._world.view_from_pose(surface, x_mm, y_mm, orientation_rad, time_s, self._direction, height_mm)
+        rng = np.random.default_rng([*self._seed, self._first + len(self._white)])
+        self._views = here if self._views is None else _joined(self._views, here)
+        self._last_mm, self._white = place_mm, np.append(self._white, rng.standard_normal())
+        return float(self._world._recorded_readings(self._views, rng, self._white)[-1])
+
+
+def _joined(before: View, after: View) -> View:
+    """Join the views of readings of one scan."""
+    rows: dict[str, Any] = {
+        name: np.concatenate([getattr(before.rows, name), getattr(after.rows, name)])
+        for name in ("place_mm", "direction", "orientation_rad", "time_s", "scan", "across", "edge_mm")
+    }
+    covariates = {
+        name: np.append(column, after.rows.covariates[name]) for name, column in before.rows.covariates.items()
+    }
+    return View(
+        np.append(before.seen, after.seen),
+        np.append(before.dimming, after.dimming),
+        replace(before.rows, **rows, covariates=covariates),
+    )

@@ -35,13 +35,16 @@ def test_a_simulated_arm_that_lacks_the_effects_of_its_sensor_says_so(explore, s
     with_drift = replace(sensor, names=names, samples=np.hstack([sensor.samples, more]), effects=("gain_drift",))
     write_sensor(with_drift, sensor_file)
     assert explore("--trust", 1, "--max-readings", 1)[0] == 0
-    assert "but not its effects: gain drift" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "but not its effects: gain drift" in said
+    assert "bits about the shape, " in said
 
 
 def test_what_the_world_conceals_is_in_the_journal_and_the_summary(explore, capsys):
     assert explore("--conceal", "gain:-0.5", "--max-readings", 1)[1][0]["concealed"] == "gain:-0.5"
     said = capsys.readouterr().out
     assert "concealed    gain:-0.5" in said
+    assert "bits about the shape and the sensor, " in said
     assert "sensor       The sensor model leaves nothing out that shows" in said
     assert explore("--max-readings", 1, "--resume")[0] == 2  # without what it conceals
 

@@ -102,6 +102,11 @@ class Step(Judgement, ShowsItself):
         return self.by_kind.left_out
 
     @property
+    def learns_of(self) -> str:
+        """What the bits are about, in words: the shape, and the sensor where its model or a left-out effect is open."""
+        return "the shape and the sensor" if self.sensor or self.by_kind.doubts_sensor else "the shape"
+
+    @property
     def log_z(self) -> float:
         """Natural log of the evidence of all readings so far."""
         return self.posterior.log_z
@@ -237,7 +242,7 @@ class Exploration(Reported):
         lines = [
             f"readings     {len(self.steps)}",
             f"stopped      {self.stop_reason}",
-            f"information  {last.bits:.1f} bits, {self.bits_per_reading:.2f} per reading{paper}",
+            f"information  {last.bits:.1f} bits about {last.learns_of}, {self.bits_per_reading:.2f} per reading{paper}",
             f"log Z        {self.posterior.log_z:.2f} ± {self.posterior.log_z_error:.2f}",
             "fit          not tested: the most probable noise is not the declared one"
             if last.p_value is None

@@ -186,7 +186,8 @@ def draw_widths_and_information(runs: Mapping[str, Sequence[Step]], *, target_mm
     axes = grid_of_axes(1, 2, size_in=(PAGE_IN, 3.6))
     widths = {name: np.array([s.largest_sd_mm for s in steps]) for name, steps in runs.items()}
     posterior_widths(widths, target_mm=target_mm, ax=axes[0, 0])
-    information_gained({name: np.array([s.bits for s in steps]) for name, steps in runs.items()}, ax=axes[0, 1])
+    gained = {name: np.array([s.bits for s in steps]) for name, steps in runs.items()}
+    information_gained(gained, about=next(iter(runs.values()))[-1].learns_of, ax=axes[0, 1])
     return axes
 
 
@@ -304,7 +305,7 @@ def page_html(
         html.figure(
             draw("progress", lambda: png(draw_widths_and_information(runs, target_mm=run.experiment.stop_sd_mm))),
             "Left: widest posterior sd of a length after each reading; dashed: the target precision. Right: "
-            "information about the shape, prior minus posterior differential entropy.",
+            f"information about {last.learns_of}, prior minus posterior differential entropy.",
         ),
         steps_table(run, unit),
     )
@@ -336,6 +337,7 @@ def _facts(run: Exploration, model: str, seed: int | None) -> dict[str, str]:
     fits = "not tested: the most probable noise is not the declared one"
     if p_value is not None:
         fits = f"p = {p_value:.2g}: if the model is right, {100 * p_value:.0f} of 100 runs fit no better"
+    gained = f"{number_text(run.last.bits, 1)} bits, {number_text(run.bits_per_reading, 2)} per reading"
     paper = f"{number_text(run.paper_bits_per_reading, 2)} bits per reading (25 bits over the readings)"
     off = probability_text(probability_of_length_off(run.experiment, run.posterior, WRONG_MM))
     return {
@@ -344,7 +346,7 @@ def _facts(run: Exploration, model: str, seed: int | None) -> dict[str, str]:
         "stopped because": run.stop_reason,
         **({"concealed in the simulated world": run.concealed} if run.concealed else {}),
         "cost": f"{count_with_noun(len(run.steps), 'reading')}, {number_text(run.seconds, 0)} s of arm time",
-        "information": f"{number_text(run.last.bits, 1)} bits, {number_text(run.bits_per_reading, 2)} per reading",
+        f"information about {run.last.learns_of}": gained,
         **({"the paper's count": paper} if run.target_reached else {}),
         f"probability that a length is off by over {WRONG_MM:g} mm": off,
         "fit of the best hypothesis": fits,

@@ -132,15 +132,18 @@ def set_up_width_axes(ax: Axes, target_mm: float) -> Axes:
     return canvas.label_axes(ax, x="number of readings", y="widest posterior sd (mm)")
 
 
-def information_gained(bits: Mapping[str, FloatArray], *, ax: Axes | None = None) -> Axes:
-    """Draw prior minus posterior differential entropy (bits) after each reading, (n_readings,), of each run by name."""
+def information_gained(bits: Mapping[str, FloatArray], *, about: str = "the shape", ax: Axes | None = None) -> Axes:
+    """Draw prior minus posterior differential entropy (bits) after each reading, (n_readings,), of each run by name.
+
+    `about` says of what, in the axis's label.
+    """
     ax = canvas.axes_or_new(ax, size_in=(6.4, 3.6))
     for k, (name, gained) in enumerate(bits.items()):
         per_reading = gained[-1] / len(gained) if len(gained) else 0.0
         label = f"{name}: {per_reading:.2f} bits per reading"
         ax.plot(np.arange(len(gained) + 1), np.r_[0.0, gained], label=label, **_dots_and_line(k))
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    return canvas.finish(ax, x="number of readings", y="information about the shape (bits)", plain=None)
+    return canvas.finish(ax, x="number of readings", y=f"information about {about} (bits)", plain=None)
 
 
 def _dots_and_line(k: int) -> dict[str, Any]:

@@ -79,6 +79,15 @@ def test_a_frame_in_the_axes_of_the_one_before_is_the_frame_in_new_axes(run, fra
     assert last == frames[-1] != frames[0]
 
 
+def test_frames_of_both_models_have_the_field_at_the_same_place(run):
+    left = []
+    for step in run.steps:
+        views = [(name, step, run.experiment) for name in ("naive model", "SSF model")]
+        frame = exploration.robot_views_by_model_png(views, [(r.pose.x_mm, 0, 0) for r in run.readings], levels=(0, 60))
+        left.append(np.asarray(Image.open(io.BytesIO(frame)))[:, :50])  # the ticks along y
+    np.testing.assert_array_equal(*left)
+
+
 def pictures_with_captions(page):
     for found in re.findall(r"<figure>.*?</figure>", page, flags=re.S):
         image = base64.b64decode(re.search(r"base64,([^\"]+)", found)[1])

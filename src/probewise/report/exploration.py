@@ -96,7 +96,7 @@ def robot_view_png(
     truth_mm: FloatArray | None = None,
 ) -> bytes:
     """Draw the robot's view after one step, with its legend; return a PNG; parameters as in `draw_robot_view`."""
-    ax = axes_of_frame()
+    (ax,) = axes_of_frame()
     draw_robot_view(step, experiment, readings, levels=levels, truth_mm=truth_mm, ax=ax)
     draw_field_legend(ax)
     return rendered_frame(ax)
@@ -137,8 +137,8 @@ def robot_views_by_model_png(
     truth_mm: FloatArray | None = None,
 ) -> bytes:
     """Draw several models' posteriors (title, step, experiment), one below the other; parameters as above."""
-    axes = grid_of_axes(len(views), 1, size_in=(8.2, 0.9 + 4.3 * len(views)))
-    for ax, (title, step, experiment) in zip(axes[:, 0], views, strict=True):
+    axes = axes_of_frame(len(views))
+    for ax, (title, step, experiment) in zip(axes, views, strict=True):
         known = f"{title}, {count_with_noun(step.number, 'reading')}, {number_text(step.bits, 1)} bits"
         draw_robot_view(step, experiment, readings, levels=levels, truth_mm=truth_mm, title=known, ax=ax)
     draw_field_legend(axes)

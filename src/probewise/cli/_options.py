@@ -227,6 +227,8 @@ def _add_seed_and_quiet(to: argparse.ArgumentParser) -> None:
 def _demo(to: argparse.ArgumentParser) -> None:
     add(to, "--out DIR")
     add(to, "--full", "compare one to four Gaussians with 300 live points, as in the paper")
+    about = "the hidden circle, radius 50 to 150 mm, entirely on the field (default: drawn from the seed)"
+    add(to, "--truth X,Y,R", about)
     _add_seed_and_quiet(to)
 
 

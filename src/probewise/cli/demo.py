@@ -19,6 +19,7 @@ from probewise.arm import Pose, read_geometry, shipped_geometry_path
 from probewise.calibration import FittedSensor, calibrate, predict, write_sensor
 from probewise.cli._common import progress_of, say
 from probewise.cli._executor import worker_pool
+from probewise.cli._options import parse_finite_numbers
 from probewise.diagnosis import Diagnosis, generators_of_diagnosis
 from probewise.experiment import (
     Exploration,
@@ -49,21 +50,26 @@ _CIRCLE = Circle(radius_mm=(50.0, 150.0), inside=True)
 def run(arguments: argparse.Namespace) -> int:
     """Calibrate, search and diagnose, write all files, and print the summary; return the exit status."""
     out = checked_output_directory(arguments.out, main="answers.json")
+    hidden = HiddenShape.drawn_from_prior({"circle": _CIRCLE}, rng=np.random.default_rng([arguments.seed, 0]))
+    if arguments.truth is not None:
+        values = parse_finite_numbers("--truth", arguments.truth, 3, "X,Y,R in mm, such as 600,260,90")
+        hidden = HiddenShape.from_parameters("circle", _CIRCLE, np.array(values), called=f"--truth {arguments.truth}")
     with progress_of(arguments) as progress:
-        drawings, lines = _run_demo(out, seed=arguments.seed, full=arguments.full, progress=progress)
+        drawings, lines = _run_demo(out, hidden, seed=arguments.seed, full=arguments.full, progress=progress)
     say(arguments, *lines)
     for each in drawings:
         each.raise_if_any_failed()
     return 0
 
 
-def _run_demo(out: Path, *, seed: int, full: bool, progress: Progress) -> tuple[list[Drawings], list[str]]:
+def _run_demo(
+    out: Path, hidden: HiddenShape, *, seed: int, full: bool, progress: Progress
+) -> tuple[list[Drawings], list[str]]:
     from probewise.report import demo as report  # here, as the processes that search import this file and draw nothing
     from probewise.report.diagnosis import output_of
 
     started = time.monotonic()
-    drawn_truth = _CIRCLE.prior.from_unit_cube(np.random.default_rng([seed, 0]).random((1, 3)))[0]
-    truth, doing = tuple(drawn_truth.tolist()), "calibrating, searching and diagnosing"
+    doing = "calibrating, searching and diagnosing"
     with worker_pool(2) as pool:
         progress(doing, 0, 6)
         diagnosing = pool.submit(diagnose_shipped_recording, seed)
@@ -73,7 +79,7 @@ def _run_demo(out: Path, *, seed: int, full: bool, progress: Progress) -> tuple[
         sensor = calibration.sensor
 
         def seek(stream: int, max_readings: int = MAX_READINGS, **options: Any) -> Any:
-            return pool.submit(_search, sensor, truth, seed, stream, max_readings=max_readings, **options)
+            return pool.submit(_search, sensor, hidden, seed, stream, max_readings=max_readings, **options)
 
         doubts: dict[str, Any] = {"saturates_at": report.SATURATION, "max_readings": MAX_READINGS_DOUBT}
         doubting = {name: seek(7, trust=trust, **doubts) for name, trust in _TRUSTS.items()}
@@ -116,7 +122,7 @@ def _run_demo(out: Path, *, seed: int, full: bool, progress: Progress) -> tuple[
 
 def _search(
     sensor: FittedSensor,
-    truth: tuple[float, ...],
+    hidden: HiddenShape,
     seed: int,
     stream: int,
     *,
@@ -134,9 +140,8 @@ def _search(
         world = replace(world, concealed=(saturation(saturates_at),))
     experiment = experiment_for(sensor, _CIRCLE, field, n_live=N_LIVE_ROBOT, **{"trust": 1.0, **options})
     rng = np.random.default_rng([seed, stream])
-    hidden = HiddenShape("circle", _CIRCLE, np.array(truth))
     with arm_over(world, hidden.surface, field, seed=seed) as arm:
-        x_mm, y_mm, radius_mm = truth
+        x_mm, y_mm, radius_mm = hidden.theta.tolist()
         away, turn = np.random.default_rng([seed, 5]).random(2)
         away_mm, turn_rad = radius_mm * np.sqrt(away), 2 * np.pi * turn
         first = Pose(float(x_mm + away_mm * np.cos(turn_rad)), float(y_mm + away_mm * np.sin(turn_rad)))

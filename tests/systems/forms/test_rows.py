@@ -81,10 +81,9 @@ _RNG = np.random.default_rng(3)
 _X = np.sort(_RNG.uniform(0, 10, 50))
 
 
-def _prepared(x=_X, *, time=None, **more):
-    simulator = Simulator(
-        "y", "V", {"a": (-5, 5), "b": (-5, 5)}, simulate=lambda p, u: p["a"] + p["b"] * u["x"], time=time
-    )
+def _prepared(x=_X, *, time=None, run=None, **more):
+    prior = {"a": (-5, 5), "b": (-5, 5)}
+    simulator = Simulator("y", "V", prior, simulate=lambda p, u: p["a"] + p["b"] * u["x"], time=time, run=run)
     y = 1 + 2 * x + 0.1 * np.random.default_rng(4).standard_normal(len(x))
     return prepare_system(simulator, table_for(simulator, {"x": x, **more, "y": y}))
 
@@ -97,6 +96,15 @@ def test_only_a_column_that_drives_the_simulator_sorts_a_table_without_a_time():
     assert sorting_column(_prepared(_X[::-1]).apparatus.about) == "x"
     assert sorting_column(_prepared(_RNG.permutation(_X), number=number).apparatus.about) is None
     assert sorting_column(_prepared(time="t", t=number).apparatus.about) is None
+
+
+@pytest.mark.parametrize(
+    ("levels", "adds_up"), [(np.arange(10.0), False), (_RNG.permutation(10.0 * np.arange(10)), True)]
+)
+def test_nothing_adds_up_in_runs_that_a_column_sorts(levels, adds_up):
+    about = _prepared(np.tile(levels, 5), run="tree", tree=np.repeat(list("abcde"), 10)).apparatus.about
+    assert sorting_column(about) is None
+    assert any("sum over rows" in form.name for form in formula_forms(about)) == adds_up
 
 
 def test_a_jump_of_a_sorted_table_shows_in_the_column_and_says_so():

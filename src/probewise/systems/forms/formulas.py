@@ -97,8 +97,8 @@ def formula_forms(about: ReferenceFit) -> Iterator[Effect]:
     yield from _forms_of_terms(about, [*_terms_of(centred), *shapes], look_up, (about.predicted, table))
     for name in columns:
         yield from _threshold_form(about, name)
-    # What adds up along rows that a column sorts is a function of that column.
-    adds_up = bool(in_time) or (about.rows_are_in_order and sorting_column(about) is None)
+    # What adds up along rows that a column sorts is a function of that column, in runs that take the same values.
+    adds_up = bool(in_time) or (about.rows_are_in_order and sorting_column(about, in_runs=True) is None)
     for name, values in columns.items():
         yield from _varying_influence_form(about, name, values)
         if adds_up:

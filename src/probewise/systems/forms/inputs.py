@@ -60,8 +60,10 @@ def driving_columns(about: ReferenceFit) -> list[str]:
     return out
 
 
-def sorting_column(about: ReferenceFit) -> str | None:
+def sorting_column(about: ReferenceFit, *, in_runs: bool = False) -> str | None:
     """Return the name of a column that drives the simulator and rises or falls along all rows; None if none does.
+
+    If `in_runs`, one that rises along the rows of every run, or falls along those of every run.
 
     Where a time was recorded, there is none: rows are in its order, whatever they are sorted by besides. A column that
     drives nothing, such as a number of the reading, may be that order itself.
@@ -69,7 +71,8 @@ def sorting_column(about: ReferenceFit) -> str | None:
     table = about.table
     if table.has_varying_time:
         return None
-    changes = {name: np.diff(values) for name, values in table.covariates.items() if np.ptp(values) > 0}
+    counted = np.diff(table.scan) == 0 if in_runs else np.full(len(table) - 1, True)
+    changes = {name: np.diff(values)[counted] for name, values in table.covariates.items() if np.ptp(values) > 0}
     ordered = {name for name, change in changes.items() if np.all(change >= 0) or np.all(change <= 0)}
     return next((name for name in driving_columns(about) if name in ordered), None) if ordered else None
 

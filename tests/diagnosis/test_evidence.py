@@ -158,6 +158,21 @@ def test_a_pair_of_noises_has_no_less_evidence_than_all_its_nodes():
     assert _mean_and_sd(own)[0][0] == pytest.approx(0.75, abs=0.05)
 
 
+def test_rounding_beyond_doubt_keeps_its_step_in_every_pair_of_noises():
+    found, recording = _found_with(_correlated(WHITE[:300] * WIDE[:300], 0.75))
+    recording = recording.with_readings(np.round(recording.readings))
+    found = replace(found, residuals=recording.readings - found.predicted)
+    rounded = cast(NoiseEffect, VOCABULARY["quantisation"](EXTENT))
+    effects = {"outliers": outliers(), "correlated_noise": correlated_noise(), "quantisation": rounded}
+    noises = NoiseModels(recording, effects, PriorOdds())
+    assert noises.certain == ("quantisation",)
+    assert noises.add_significant_pairs(found, noises.evidence_by_noise(found))
+    assert len(noises.models) > len(effects)
+    for names, evidence in noises.evidence_by_noise(found).items():
+        at = evidence.noise.columns_of_effect("quantisation")
+        np.testing.assert_allclose(evidence.nodes.settings[:, at], 1.0, err_msg=str(names))
+
+
 def test_a_fit_at_the_edge_of_its_formula_is_impossible_under_any_noise():
     """A slope there is no number; neither is it a warning."""
     found, recording = _found_with(WHITE[:100])

@@ -91,6 +91,8 @@ def test_a_lattice_shows_through_printing(digits):
         missed += abs(lattice_step(printed) - step) > 5 * sd_of_estimated_lattice_step(printed, step)
         assert lattice_step(np.round(readings, digits)) in (pytest.approx(10.0**-digits), 0.0)
     assert missed <= 1  # a step that happens to be nearly a round number
+    whole = np.round(readings, digits)
+    assert sd_of_estimated_lattice_step(whole, 10.0**-digits) <= 1e-6 * 10.0**-digits
 
 
 @pytest.mark.parametrize("unit", [1e-12, 1.0, 1e9])

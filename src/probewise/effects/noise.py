@@ -386,7 +386,8 @@ def sd_of_estimated_lattice_step(readings: FloatArray, step: float) -> float:
     fits = (np.allclose(values, np.round(values, n), rtol=0, atol=_DIGITS * 10.0**-n) for n in range(first, first + 10))
     digit = next((10.0**-n for n, fit in enumerate(fits, first) if fit), 0.0)
     reach = float(np.linalg.norm(values - values.mean())) / step
-    return max(sd_of_rounding(digit) / reach, _DIGITS * step)
+    is_printing = digit > (1 - _DIGITS) * step  # whole numbers are a lattice of exactly 1
+    return max(0.0 if is_printing else sd_of_rounding(digit) / reach, _DIGITS * step)
 
 
 def _step_of_rounded_lattice(values: FloatArray, rounding: float) -> float:

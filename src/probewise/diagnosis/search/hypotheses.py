@@ -293,7 +293,7 @@ class NoiseModels:
                 coarse = {}  # of effects with many nodes of one parameter, every third
                 for effect in self.models[other].effects:
                     nodes = effect.entries[:, 0, :]
-                    if len(nodes) > _MANY and nodes.shape[1] == 1:
+                    if effect.name not in self._known and len(nodes) > _MANY and nodes.shape[1] == 1:
                         coarse[effect.name] = nodes[1::3], np.full(len(nodes[1::3]), -math.log(len(nodes[1::3])))
                 nearby = laplace_evidence(found, self._build_model(both, likely | coarse))
                 least = best - ENOUGH_NATS - self.log_prior(both)

@@ -13,8 +13,8 @@ the readings that a diagnosis advises.
 
 `Inquiry(model, prior, settings, noise, rng=rng)` chooses the settings of any other instrument.
 
-`Recording.from_table` makes recordings, `read_recording`, `read_plan` and `read_sensor` read files. Results display
-themselves in notebooks.
+`Recording.from_table` makes recordings; `read_recording`, `read_plan`, `read_sensor`, `read_simulator` and
+`read_fitted_system` read files. Results display themselves in notebooks.
 
 The parts are packages, loaded at first use. In the order of one reading's path: `arm` (where readings come from),
 `recordings`, `scene` (what lies under the sensor), `sensor` (from scene to reading), `inference`, `nested` (evidence
@@ -59,7 +59,7 @@ if TYPE_CHECKING:
     from probewise.inquiry import Inquiry
     from probewise.investigation import investigate
     from probewise.recordings import Plan, Recording, read_plan, read_recording
-    from probewise.systems import Law, Simulator, read_simulator
+    from probewise.systems import Law, Simulator, read_fitted_system, read_simulator
 
 __all__ = [
     "Inquiry",
@@ -76,6 +76,7 @@ __all__ = [
     "investigate",
     "nested",
     "predict",
+    "read_fitted_system",
     "read_plan",
     "read_recording",
     "read_sensor",
@@ -88,7 +89,7 @@ _NAMES = {
     "inquiry": ("Inquiry",),
     "investigation": ("investigate",),
     "recordings": ("Plan", "Recording", "read_plan", "read_recording"),
-    "systems": ("Law", "Simulator", "read_simulator"),
+    "systems": ("Law", "Simulator", "read_fitted_system", "read_simulator"),
 }
 _HOME = {name: home for home, names in _NAMES.items() for name in names}
 

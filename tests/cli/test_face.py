@@ -4,6 +4,7 @@ import argparse
 import importlib
 import inspect
 import json
+import pickle
 import subprocess
 import sys
 import tomllib
@@ -200,6 +201,7 @@ def test_the_verbs_take_a_table_and_a_simulator_too(tmp_path, sensor):
     found = probewise.diagnose(halves, simulator=probewise.read_simulator(file), rng=rng, progress=False)
     assert found.verdict == "clean"
     assert len(probewise.predict(found, table, rng=rng, progress=False).mean) == 40
+    assert pickle.loads(pickle.dumps(found)).summary() == found.summary()
     assert probewise.audit(table, simulator=file, progress=False).cure_plan is None
     with pytest.raises(ParameterError, match="None with a simulator"):
         probewise.diagnose(table, simulator=file, sensor=sensor, rng=rng)

@@ -1,6 +1,7 @@
 """An inquiry over any settings: its posterior against a closed form, its choices, its forms, what it refuses."""
 
 import math
+import pickle
 import subprocess
 import sys
 import warnings
@@ -19,6 +20,10 @@ PLACES = np.linspace(0.0, 2.0, 5)
 
 def line(p, x):
     return p["offset"] + p["slope"] * x
+
+
+def line_of_numbers(p, x):
+    return math.fsum([p["offset"], p["slope"] * x])
 
 
 def inquiry(*, seed=0, model=line, prior=LINE, settings=PLACES, noise=0.3, **options):
@@ -52,6 +57,13 @@ def test_posterior_and_evidence_of_a_line_are_the_closed_form():
     assert found.evidence[0] == pytest.approx(log_z, abs=5 * found.evidence[1] + 0.01)
     assert found.evidence[1] < 0.1
     assert found.doubt is None
+
+
+@pytest.mark.parametrize("model", [line, line_of_numbers])
+def test_a_pickled_inquiry_goes_on_as_it_would(model):
+    asked = follow(inquiry(model=model), lambda x: 0.5, 2)
+    again = pickle.loads(pickle.dumps(asked))
+    assert follow(again, lambda x: 0.7, 2).readings == follow(asked, lambda x: 0.7, 2).readings
 
 
 def test_a_surprising_reading_starts_nested_sampling_anew():

@@ -22,11 +22,11 @@ from probewise.systems import RunTable, Simulator, System
 from probewise.systems.forms import (
     ReferenceFit,
     bind_forms,
+    bind_proposals,
     has_value_per_run,
     names_in_definitions,
     names_of_jumps_in_sorted_rows,
 )
-from probewise.systems.forms.formulas import formula_forms
 from probewise.systems.forms.modulations import time_since_start_of_run
 from probewise.systems.table import append_tables, covariate_of_column, unused_name
 
@@ -230,7 +230,7 @@ class SimulatorApparatus(Apparatus):
         return bind_forms(self.about) | {effect.name: effect for effect in beside if effect is not None}
 
     def proposed_formulas(self) -> dict[str, Effect]:
-        return cast(dict[str, Effect], {form.name: form for form in formula_forms(self.about)})
+        return bind_proposals(self.about)
 
     def user_effect_names(self, effects: Mapping[str, Effect]) -> frozenset[str]:
         return frozenset(effects.keys() & self.system.simulator.extra.keys())

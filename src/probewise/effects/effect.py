@@ -87,9 +87,9 @@ class Where:
 class Binding:
     """How an effect is bound to a recording.
 
-    `counted_from`: from where it counts a time, a place or a column, in words; "" for 0, or if it does not count. Of a
-    light sensor's effect: `where` it acts; which of several formulas it has (`form`); and a function that builds one
-    with the same `apply` and `sentence` (`source`), by which a pickled effect finds them again.
+    `counted_from`: from where it counts a time, a place or a column, in words; "" for 0, or if it does not count.
+    `source`: a function that builds an effect with the same `apply` and `sentence`, by which a pickled effect finds
+    them again. Of a light sensor's effect: `where` it acts, and which of several formulas it has (`form`).
     """
 
     counted_from: str = ""

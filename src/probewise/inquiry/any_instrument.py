@@ -170,19 +170,9 @@ class InstrumentModel:
         ParameterError if no prediction is finite, or if another call with the same parameters returns other readings.
         """
         names = prior.names
-
-        def together(theta: FloatArray, at: Settings) -> FloatArray:
-            parameters = {name: theta[:, [k]] for k, name in enumerate(names)}
-            return _called(function, parameters, at.in_model_form(), (len(theta), len(at)))
-
-        def one_sample(values: bytes, at: Settings) -> FloatArray:
-            parameters = dict(zip(names, np.frombuffer(values).tolist(), strict=True))
-            return _called(function, parameters, at.in_model_form(), (len(at),))
-
-        def one_reading(values: bytes, at: Settings) -> FloatArray:
-            parameters = dict(zip(names, np.frombuffer(values).tolist(), strict=True))
-            return np.array([_called(function, dict(parameters), at[k], ()) for k in range(len(at))])
-
+        together, one_sample, one_reading = (
+            partial(call, function, names) for call in (_all_readings, _readings_of_sample, _each_reading_of_sample)
+        )
         theta = prior.from_unit_cube(np.linspace(0.2, 0.8, _N_PROBED)[:, None] * np.ones(len(names)))
         some = settings.take(np.unique(np.linspace(0, len(settings) - 1, _N_PROBED).astype(int)))
         try:
@@ -194,12 +184,7 @@ class InstrumentModel:
                 return cls(together, True, prior, noise)
         except Exception:  # it takes no arrays
             pass
-        remembered = lru_cache(max(_BLOCK // len(settings), 1))(one)
-
-        def one_by_one(theta: FloatArray, at: Settings) -> FloatArray:
-            return np.array([remembered(sample[: len(names)].tobytes(), at) for sample in theta])
-
-        return cls(one_by_one, False, prior, noise)
+        return cls(_OneByOne(one, len(names), max(_BLOCK // len(settings), 1)), False, prior, noise)
 
     @cached_property
     def prior(self) -> Prior:
@@ -232,6 +217,38 @@ class InstrumentModel:
     def scale(self, theta: FloatArray, predicted: FloatArray) -> FloatArray:
         """Return the sd of the noise of each prediction, (n_samples, n_settings)."""
         return self.noise.scale(predicted, theta[:, -1] if self.noise.is_sd_inferred else None)
+
+
+def _all_readings(function: Callable[..., Any], names: Sequence[str], theta: FloatArray, at: Settings) -> FloatArray:
+    parameters = {name: theta[:, [k]] for k, name in enumerate(names)}
+    return _called(function, parameters, at.in_model_form(), (len(theta), len(at)))
+
+
+def _readings_of_sample(function: Callable[..., Any], names: Sequence[str], values: bytes, at: Settings) -> FloatArray:
+    parameters = dict(zip(names, np.frombuffer(values).tolist(), strict=True))
+    return _called(function, parameters, at.in_model_form(), (len(at),))
+
+
+def _each_reading_of_sample(
+    function: Callable[..., Any], names: Sequence[str], values: bytes, at: Settings
+) -> FloatArray:
+    parameters = dict(zip(names, np.frombuffer(values).tolist(), strict=True))
+    return np.array([_called(function, dict(parameters), at[k], ()) for k in range(len(at))])
+
+
+class _OneByOne:
+    """Calls `one` for one sample after the other and remembers the readings of the last `n_remembered`."""
+
+    def __init__(self, one: Callable[[bytes, Settings], FloatArray], n_params: int, n_remembered: int) -> None:
+        self._made_of = (one, n_params, n_remembered)
+        self._remembered = lru_cache(n_remembered)(one)
+
+    def __call__(self, theta: FloatArray, at: Settings) -> FloatArray:
+        """Return the readings of samples, (n_samples, n_params), at settings, (n_samples, n_settings)."""
+        return np.array([self._remembered(sample[: self._made_of[1]].tobytes(), at) for sample in theta])
+
+    def __reduce__(self) -> tuple[type[_OneByOne], tuple[Any, ...]]:
+        return _OneByOne, self._made_of
 
 
 def _called(function: Callable[..., Any], parameters: Any, settings: Any, shape: tuple[int, ...]) -> FloatArray:
@@ -319,6 +336,9 @@ class ReadingsProblem:
 
 class Inquiry(ShowsItself):
     """An inquiry: the posterior of a model's parameters, and the setting with the largest acquisition function.
+
+    It can be pickled if its functions can: those that `def` defines in a module, no lambdas, none within a function.
+    Of any other keep `readings`.
 
     Parameters
     ----------

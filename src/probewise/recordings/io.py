@@ -270,19 +270,34 @@ class EndedByFile(Exception):
     """What a function of a user's file raised that is no Exception, such as SystemExit; the text names it."""
 
 
-def raising_exceptions(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function of a user's file so that whatever it raises, but for Ctrl-C, is an Exception."""
+class FunctionOfFile:
+    """A function of a user's file: whatever it raises, but for Ctrl-C, is an Exception; unpickled, the file runs again.
 
-    @functools.wraps(function)
-    def call(*args: Any, **named: Any) -> Any:
+    `name` is what it is called in `text`, which `path` had when it was read.
+    """
+
+    def __init__(self, function: Callable[..., Any], name: str, text: str, path: Path) -> None:
+        functools.update_wrapper(self, function)
+        self._function, self._where = function, (name, text, path)
+
+    def __call__(self, *args: Any, **named: Any) -> Any:
+        """Call the function."""
         try:
-            return function(*args, **named)
+            return self._function(*args, **named)
         except (Exception, KeyboardInterrupt):
             raise
         except BaseException as error:
             raise EndedByFile(message_of(error)).with_traceback(error.__traceback__) from error
 
-    return call
+    def __reduce__(self) -> tuple[Callable[..., FunctionOfFile], tuple[str, str, Path]]:
+        return _function_of_file, self._where
+
+
+def _function_of_file(name: str, text: str, path: Path) -> FunctionOfFile:
+    return FunctionOfFile(_run_once(text, path)[name], name, text, path)
+
+
+_run_once = functools.lru_cache(maxsize=4)(run_python_text)  # for all functions of a file
 
 
 SHIPPED = ("paper", "concealed")

@@ -28,7 +28,7 @@ from probewise._kinds import (
 from probewise.effects import EFFECTS, RARE_EFFECTS
 from probewise.errors import FileError, ParameterError, message_of, printable, require, shown
 from probewise.priors import Marginal, parse_prior
-from probewise.recordings.io import raising_exceptions, read_text, run_python_text
+from probewise.recordings.io import FunctionOfFile, read_text, run_python_text
 from probewise.sensor import Stage
 from probewise.systems.table import RunTable, median_sd_of_column, read_run_table
 
@@ -148,6 +148,9 @@ class Extra:
 @dataclass(frozen=True, eq=False)
 class Simulator:
     """A simulator of readings and the priors of its parameters, with either `simulate` or `law`.
+
+    It, and a diagnosis or fit with it, can be pickled if its functions can: those of FILE.py, which is then run again,
+    or that `def` defines in a module, no lambdas, none within a function. Of any other `save` the result.
 
     Parameters
     ----------
@@ -295,8 +298,11 @@ def fingerprint_of_text(text: str) -> str:
 def run_simulator_text(text: str, path: Path) -> Simulator:
     """Run the text of a user's file, as `read_simulator` does."""
     said = run_python_text(text, path)
-    functions = (said.get(name) for name in ("simulate", "rates", "observe"))
-    simulate, rates, observe = (cast(Any, raising_exceptions(f) if callable(f) else f) for f in functions)
+    named = ((name, said.get(name)) for name in ("simulate", "rates", "observe"))
+    simulate, rates, observe = (
+        cast(Any, FunctionOfFile(function, name, text, path) if callable(function) else function)
+        for name, function in named
+    )
     given: dict[str, Any] = dict.fromkeys(("reading", "unit", "parameters"))
     given |= {name: said[name] for name in _OF_SYSTEM if name in said}
     try:

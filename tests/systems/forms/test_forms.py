@@ -1,5 +1,6 @@
 """Forms of the vocabulary: each does what its name says, by a route of its own."""
 
+import pickle
 import re
 from dataclasses import replace
 
@@ -361,6 +362,19 @@ def test_a_term_on_one_side_acts_beyond_its_threshold_alone():
     found = _read(form.name, -0.5, 2.0, about=about, forms={form.name: form})
     beyond = np.maximum(_T - 2.0, 0.0)
     np.testing.assert_allclose(found, np.minimum(_T, 2.0) + (1 - np.exp(-0.5 * beyond)) / 0.5, atol=1e-3)
+
+
+def _of_drive(p, u):
+    return p["offset"] + p["gain"] * u["drive"]
+
+
+def test_a_pickled_form_finds_its_functions_again():
+    forms = bind_forms(_about(_simulator(simulate=_of_drive)))
+    for form in (forms[name] for name in ("lag", "curve:drive", "differs:gain", "interference~again", "offset_step")):
+        again = pickle.loads(pickle.dumps(form))
+        theta = np.concatenate([ABOUT.theta[0], form.entries[0, 0]])[None, :]
+        one, other = (ABOUT.system.chain(TABLE, [each]).predict(theta, TABLE) for each in (form, again))
+        np.testing.assert_array_equal(one, other)
 
 
 def test_a_form_that_looks_back_to_earlier_times_says_so():

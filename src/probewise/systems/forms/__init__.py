@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from functools import partial
 from types import MappingProxyType
 from typing import Any
 
@@ -25,7 +26,7 @@ from probewise.systems.simulator import Simulator
 from probewise.systems.system import System
 from probewise.systems.table import covariate_of_column
 
-__all__ = ["WORDS", "ReferenceFit", "StoredFit", "bind_forms", "driving_columns", "sorting_column"]
+__all__ = ["WORDS", "ReferenceFit", "StoredFit", "bind_forms", "bind_proposals", "driving_columns", "sorting_column"]
 
 WORDS: Mapping[str, str] = MappingProxyType(
     {
@@ -78,7 +79,28 @@ def bind_forms(about: ReferenceFit) -> dict[str, Effect]:
         named = [replace(f, covariates=(along, *f.covariates)) if jumps_at_row(f) else f for f in named]
     found = [*named, *forms_of_extras(about)]
     waves = [_second_wave(form) for form in found if isinstance(form, WaveEffect)]
-    return {form.name: form for form in [*found, *waves]}
+    return _by_name(about, [*found, *waves])
+
+
+def bind_proposals(about: ReferenceFit) -> dict[str, Effect]:
+    """Return every formula that could be detectable near this fit, by name."""
+    return _by_name(about, formula_forms(about))
+
+
+def _by_name(about: ReferenceFit, forms: Iterable[Effect]) -> dict[str, Effect]:
+    """Return forms by name; a pickled one finds its functions again by that, bound to what is stored of the fit."""
+    known = extract_stored_fit(about) if about.known is None else about.known
+
+    def restorable(form: Effect) -> Effect:
+        source = partial(_form_again, form.name, about.system.simulator, known)
+        variants = tuple(restorable(other) for other in form.alternatives)
+        return replace(form, alternatives=variants, binding=replace(form.binding, source=source))
+
+    return {form.name: restorable(form) for form in forms}
+
+
+def _form_again(name: str, simulator: Simulator, known: StoredFit) -> Effect:
+    return rebind_forms([name], simulator, known)[name]
 
 
 def _second_wave(form: Effect) -> Effect:
@@ -148,7 +170,7 @@ def _bind_wanted_forms(wanted: list[str], simulator: Simulator, known: StoredFit
     about = ReferenceFit(system, known.table, np.zeros(system.n_params), known.sd, known=known)
     found = bind_forms(about)
     if any(name.startswith(PROPOSAL) for name in wanted):
-        found |= {form.name: form for form in formula_forms(about)}
+        found |= bind_proposals(about)
     return {name: found[name] for name in wanted if name in found}
 
 

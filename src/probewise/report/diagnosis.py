@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import cast
 
 import numpy as np
 
@@ -97,20 +96,14 @@ def sections(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> list[html.Sect
 def page_html(diagnosis: Diagnosis, drawn: Mapping[str, bytes], *, source: str, seed: int | None) -> str:
     """Return the HTML of a diagnosis's page; `drawn` is from `figure_drawers`."""
     n_used = int(diagnosis.recording.usable[rows_to_diagnose(diagnosis.recording)].sum())
-    readings = f"{n_used} used of {len(diagnosis.recording)}"
-    facts = {
-        "recordings": source,
-        "readings": readings,
-        **html.seed_fact(seed),
-        **dict(diagnosis.apparatus.words.facts),
-    }
+    facts = {"recordings": source, "readings": f"{n_used} used of {len(diagnosis.recording)}", **html.seed_fact(seed)}
+    facts |= dict(diagnosis.apparatus.words.facts)
     notes = html.notes_in_words((*diagnosis.recording.notes, *notes_on_calls(diagnosis)))
     shown = html.figure(drawn["first.svg"], _first_figure_caption(diagnosis))
-    first = html.fragment(shown, html.definition_list(_questions_and_answers(diagnosis)))
     return html.page(
         f"Diagnosis of {source}: {diagnosis.verdict.replace('_', ' ')}",
         answer=summary_sentence(diagnosis),
-        key_figure=first,
+        key_figure=html.fragment(shown, html.definition_list(_questions_and_answers(diagnosis))),
         sections=[*sections(diagnosis, drawn), html.Section("This run", (facts, *notes))],
         with_terms=True,
     )
@@ -182,17 +175,13 @@ def _formula_in_words(formula: Formula) -> str:
 
 
 def _heldout_gain_in_words(nats: float, sd: float) -> str:
-    measured = f"{_signed_nats(nats, sd)} per held-out reading"
+    written = value_with_sd(nats, sd)
+    measured = f"{typeset_numbers(written if written.startswith('-') else f'+{written}')} nats per held-out reading"
     if nats > 2 * sd:
         times = math.exp(min(nats, 50.0))
         many = f"{times:.3g}" if times < 1000 else "over a thousand"
         return f"Yes: each reading is {many} times as probable as before ({measured})."
     return f"{'No better than before' if nats > -2 * sd else 'Worse than before'}: {measured}."
-
-
-def _signed_nats(nats: float, sd: float) -> str:
-    written = value_with_sd(nats, sd)
-    return f"{typeset_numbers(written if written.startswith('-') else f'+{written}')} nats"
 
 
 def _could_be_chance_in_words(diagnosis: Diagnosis) -> str:
@@ -219,11 +208,10 @@ def _next_readings_in_words(diagnosis: Diagnosis) -> str:
     if plan is None:
         return "No readings that were considered, within the ranges recorded here, would settle what is open."
     told = plan.expected_log_bayes_factor
-    asked = count_with_noun(len(plan.plan), "reading")
+    taken = count_with_noun(len(plan.plan), "reading")
     if diagnosis.apparatus.words.tells_duration:
-        asked += f", about {duration_text(plan.minutes)}"
-    description, file = plan.description.rstrip("."), diagnosis.apparatus.words.next_plan
-    said = f"{description}: {asked}, {file}."
+        taken += f", about {duration_text(plan.minutes)}"
+    said = f"{plan.description.rstrip('.')}: {taken}, {diagnosis.apparatus.words.next_plan}."
     classes = [join_lists([plan.between[k] for k in own], "or") for own in plan.classes_among(plan.effects)]
     separated = " from ".join(classes) if len(classes) == 2 else join_lists(classes)
     nats = "more than 100" if told > 100 else number_text(told, 0 if told >= 10 else 1)  # no one needs more
@@ -231,13 +219,8 @@ def _next_readings_in_words(diagnosis: Diagnosis) -> str:
 
 
 def _explanation_elements(diagnosis: Diagnosis) -> Sequence[str]:
-    credible = [hypothesis_in_words(() if k == "clean" else k.split("+")) for k in diagnosis.credible]
+    credible = "; ".join(hypothesis_in_words(() if k == "clean" else k.split("+")) for k in diagnosis.credible)
     likely = sorted((e for e in diagnosis.effects if e.probability > _LIKELY), key=lambda e: -e.size_lambda)
-    told = [
-        f"{effect_in_words(e.name)} ({probability_text(e.probability)}, alone or beside others): {e.sentence}"
-        for e in likely
-    ]
-    held = f"95 % credible set (the fewest explanations that hold 0.95): {'; '.join(credible)}."
     candidates = ", ".join(
         f"{effect_in_words(name) if effect_has_words(name) else term_family_in_words(name)} ({probability_text(p)})"
         for name, p in diagnosis.unknown_candidates
@@ -245,8 +228,14 @@ def _explanation_elements(diagnosis: Diagnosis) -> Sequence[str]:
     )
     opening = "Candidates for the unknown effect (a covariate that it depends on, or a form)"
     return (
-        *(_as_sentence(diagnosis, said) for said in told),
-        held,
+        *(
+            _as_sentence(
+                diagnosis,
+                f"{effect_in_words(e.name)} ({probability_text(e.probability)}, alone or beside others): {e.sentence}",
+            )
+            for e in likely
+        ),
+        f"95 % credible set (the fewest explanations that hold 0.95): {credible}.",
         *([f"{opening}: {candidates}."] if candidates else []),
         *(  # effects in the repaired model's samples that are not among the diagnosis's
             _as_sentence(diagnosis, f"In {share:.0%} of the repaired model's samples: {sentence}")
@@ -285,10 +274,10 @@ def _place_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> Sequenc
     opening = (
         f"Residuals of the {diagnosis.apparatus.words.unrepaired} model against each covariate in which they are "
         "significant: the headline's first, then the most visible. Each dot is a reading; by chance alone, 95 % of the "
-        f"means would lie in the grey band."
+        "means would lie in the grey band."
     )
-    first, rest = shown[:_MOST_PLACES], shown[_MOST_PLACES:]
-    return (opening, *first, *((html.details(f"{len(rest)} more", *rest),) if rest else ()))
+    rest = shown[_MOST_PLACES:]
+    return (opening, *shown[:_MOST_PLACES], *((html.details(f"{len(rest)} more", *rest),) if rest else ()))
 
 
 def before_and_after_caption(diagnosis: Diagnosis) -> str:
@@ -302,28 +291,26 @@ def before_and_after_caption(diagnosis: Diagnosis) -> str:
 
 
 def _before_and_after_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> Sequence[str]:
-    curves = [effect for effect in diagnosis.effects if figure_name_of(effect.name) in drawn]
     return (
         html.figure(drawn["before_after.svg"], before_and_after_caption(diagnosis)),
-        *_parameter_elements(diagnosis),
+        *([_parameter_table(diagnosis)] if isinstance(diagnosis.recording.plan, RunTable) else []),
         *(
             html.figure(drawn[figure_name_of(e.name)], _as_sentence(diagnosis, f"With the 95 % band: {e.sentence}"))
-            for e in curves
+            for e in diagnosis.effects
+            if figure_name_of(e.name) in drawn
         ),
     )
 
 
-def _parameter_elements(diagnosis: Diagnosis) -> Sequence[str]:
+def _parameter_table(diagnosis: Diagnosis) -> html.Markup:
     """Build the table of a simulator's parameters in both models; folded away if they are many. A sensor has a file."""
-    if not isinstance(diagnosis.recording.plan, RunTable):
-        return ()
     models = [(diagnosis.apparatus.words.before_in_words, diagnosis.null)]
     models += [(diagnosis.after_in_words, diagnosis.repaired)] * diagnosis.repair_changes_predictions
     columns = [dict(zip(model.chain.names, model.theta.T, strict=True)) for _, model in models]
     names = [name for name in columns[0] if name in columns[-1]]
     rows = [(k, *(value_with_error(float(c[k].mean()), float(c[k].std())) for c in columns)) for k in names]
     listed = html.table(("parameter of the simulator", *(name for name, _ in models)), rows)
-    return (listed,) if len(rows) <= _MOST_PARAMETERS else (html.details(f"{len(rows)} parameters", listed),)
+    return listed if len(rows) <= _MOST_PARAMETERS else html.details(f"{len(rows)} parameters", listed)
 
 
 def _heldout_gain_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> Sequence[str | Mapping[str, str]]:
@@ -449,30 +436,21 @@ def output_of(
     recording's own name).
     """
     source = source or value.recording.source or "the readings"
-    of_simulator = isinstance(value.recording.plan, RunTable)
     rng = rng or generators_of_diagnosis(DEFAULT_SEED if seed is None else seed)[2]
-    return Output(
-        partial(_write_files_of_simulator if of_simulator else partial(_write_files_of_light_sensor, rng=rng), value),
-        figure_drawers(value),
-        partial(page_html, value, source=source, seed=seed),
-        main="diagnosis.json",
-    )
 
+    def write_files(stage: StagedFiles) -> None:
+        stage.write_json("diagnosis.json", diagnosis_json(value))
+        plan = None if value.next_measurement is None else value.next_measurement.plan
+        if isinstance(value.recording.plan, RunTable):
+            write_fitted_system(repaired_of(value), stage / "repaired.json")
+            write_fitted_system(calibrated_of(value), stage / "calibrated.json")
+        else:
+            write_sensor(value.repaired.fitted_sensor(value.recording, rng=rng), stage / "sensor.json")
+            write_sensor(value.null.fitted_sensor(value.recording, rng=rng), stage / "calibrated.json")
+        if isinstance(plan, RunTable):
+            stage.write(value.apparatus.words.next_plan, run_table_csv(plan))
+        elif plan is not None:
+            write_plan(plan, stage / NEXT_PLAN)
 
-def _write_files_of_light_sensor(value: Diagnosis, stage: StagedFiles, *, rng: np.random.Generator) -> None:
-    """Write diagnosis.json, both sensor models and the next plan."""
-    stage.write_json("diagnosis.json", diagnosis_json(value))
-    write_sensor(value.repaired.fitted_sensor(value.recording, rng=rng), stage / "sensor.json")
-    write_sensor(value.null.fitted_sensor(value.recording, rng=rng), stage / "calibrated.json")
-    if value.next_measurement is not None:
-        write_plan(value.next_measurement.plan, stage / NEXT_PLAN)
-
-
-def _write_files_of_simulator(value: Diagnosis, stage: StagedFiles) -> None:
-    """Write diagnosis.json, the calibrated and the repaired simulator, and the next rows to take."""
-    stage.write_json("diagnosis.json", diagnosis_json(value))
-    write_fitted_system(repaired_of(value), stage / "repaired.json")
-    write_fitted_system(calibrated_of(value), stage / "calibrated.json")
-    if value.next_measurement is not None:
-        rows = cast(RunTable, value.next_measurement.plan)
-        stage.write(value.apparatus.words.next_plan, run_table_csv(rows))
+    page = partial(page_html, value, source=source, seed=seed)
+    return Output(write_files, figure_drawers(value), page, main="diagnosis.json")

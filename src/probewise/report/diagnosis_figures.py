@@ -9,12 +9,10 @@ from typing import cast
 import numpy as np
 from matplotlib.axes import Axes
 
-from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis import Diagnosis, Place
 from probewise.diagnosis.locate import figure_name_of
 from probewise.diagnosis.words import hypothesis_in_words
 from probewise.effects import Effect
-from probewise.recordings import Plan
 from probewise.report.covariates import (
     CovariateView,
     axis_label,
@@ -42,8 +40,8 @@ def figure_drawers(diagnosis: Diagnosis) -> dict[str, Callable[[], bytes]]:
     }
     gain = diagnosis.improvement
     if gain.heldout_by_scan:
-        mean_and_sd, part = (gain.heldout_log_density_per_reading, gain.heldout_sd), noun_of_held_out_part(diagnosis)
-        drawers["gain.svg"] = lambda: svg(plots.heldout_gain_by_scan(gain.heldout_by_scan, *mean_and_sd, part=part))
+        mean, sd, part = gain.heldout_log_density_per_reading, gain.heldout_sd, noun_of_held_out_part(diagnosis)
+        drawers["gain.svg"] = lambda: svg(plots.heldout_gain_by_scan(gain.heldout_by_scan, mean, sd, part=part))
     for effect in cast(Sequence[Effect], diagnosis.repaired.chain.effects):
         if effect.name.startswith("curve:"):
             drawers[figure_name_of(effect.name)] = partial(_curve_svg, diagnosis, effect)
@@ -77,15 +75,14 @@ def draw_first_figure(diagnosis: Diagnosis) -> AxesGrid:
     listed = [h for h in diagnosis.hypotheses if h.probability > _WORTH_A_BAR]
     names, most = [hypothesis_in_words(h.effects) for h in listed], min(len(listed), _MOST_BARS)
     bars = [*names[:most], *["others"] * (len(diagnosis.hypotheses) > most)]
-    axes = stack_of_axes([2.7, height_of_bars_in(bars)], aligned=False)
-    above, below = axes
+    above, below = axes = stack_of_axes([2.7, height_of_bars_in(bars)], aligned=False)
     shown = first_figure_content(diagnosis)
     if shown == "readings":
         plots.readings_in_order(diagnosis.recording, ax=above)
     elif isinstance(shown, str):
         _draw_noise_panel(diagnosis, shown, above)
     else:
-        _draw_means_along(diagnosis, shown, after=True, each=False, ax=above)
+        _draw_means_along(diagnosis, shown, each=False, ax=above)
     # All are passed on: the last bar adds up those that are not drawn.
     names += [""] * (len(diagnosis.hypotheses) - len(listed))
     probabilities = [h.probability for h in (*listed, *diagnosis.hypotheses[len(listed) :])]
@@ -98,7 +95,7 @@ def _place_svg(diagnosis: Diagnosis, place: Place) -> bytes:
     views = views_of_place(diagnosis, place)
     axes = stack_of_axes([2.4, 2.6][-len(views) :])
     for ax, view in zip(axes, views, strict=True):
-        _draw_means_along(diagnosis, view, after=False, each=True, ax=ax)
+        _draw_means_along(diagnosis, view, each=True, ax=ax)
     return svg(axes)
 
 
@@ -118,9 +115,10 @@ def _curve_svg(diagnosis: Diagnosis, curve: Effect) -> bytes:
     return svg(ax)
 
 
-def _draw_means_along(diagnosis: Diagnosis, view: CovariateView, *, after: bool, each: bool, ax: Axes) -> None:
+def _draw_means_along(diagnosis: Diagnosis, view: CovariateView, *, each: bool, ax: Axes) -> None:
+    """Draw mean residuals in a view: of the calibrated model with `each` reading, else of both models."""
     plots.mean_residuals_along(
-        noise_of(diagnosis).means_in(view, after=after),
+        noise_of(diagnosis).means_in(view, after=not each),
         label=view.label,
         unit=diagnosis.recording.plan.instrumentation.unit_after_number,
         each=(view.at, diagnosis.before.residuals) if each else None,
@@ -135,31 +133,24 @@ def _draw_means_along(diagnosis: Diagnosis, view: CovariateView, *, after: bool,
 def before_and_after(diagnosis: Diagnosis) -> AxesGrid:
     """Draw the scan that the repair changes most (else the longest): readings, one or both models, residuals below.
 
-    A random walk of the noise, as all readings show it, is part of both models' lines.
+    Scans along a line come first. A random walk of the noise, as all readings show it, is part of both models' lines.
     """
     recording, plan = diagnosis.recording, diagnosis.recording.plan
     before, after = diagnosis.before, diagnosis.after
-    rows = rows_of_scan_changed_most(plan, after.readings_with_walk - before.readings_with_walk)
+    change = after.readings_with_walk - before.readings_with_walk
+    scans = [rows for rows in plan.rows_by_scan() if rows.size]
+    lines = [rows for rows in scans if is_scan_along_line(plan, rows)]
+    rows = max(lines or scans, key=lambda rows: (float(change[rows] @ change[rows]), rows.size))
     shown = view_along_scan(diagnosis, plan.scan_names[int(plan.scan[rows[0]])])
     rows = rows[np.argsort(shown.at[rows], kind="stable")]
-    named = ((diagnosis.apparatus.words.before_in_words, before), (diagnosis.after_in_words, after))
-    models = [(name, own.readings_with_walk[rows]) for name, own in named]
+    models = [(diagnosis.apparatus.words.before_in_words, before.readings_with_walk[rows])]
+    if diagnosis.repair_changes_predictions:
+        models += [(diagnosis.after_in_words, after.readings_with_walk[rows])]
     readings = np.where(recording.usable[rows], recording.readings[rows], np.nan)
     unit = plan.instrumentation.unit_after_number
-    models = models if diagnosis.repair_changes_predictions else models[:1]
     return plots.scan_with_residuals(
         shown.at[rows], readings, models, joined=is_scan_along_line(plan, rows), label=shown.label, unit=unit
     )
-
-
-def rows_of_scan_changed_most(plan: Plan | RunTable, change: FloatArray) -> IntArray:
-    """Return row numbers of the scan, if possible along a line, with the largest sum of squares of `change`.
-
-    `change`, (n_points,), is the repair's change of each predicted reading; without any, it is the longest scan.
-    """
-    scans = [rows for rows in plan.rows_by_scan() if rows.size]
-    lines = [rows for rows in scans if is_scan_along_line(plan, rows)]
-    return max(lines or scans, key=lambda rows: (float(change[rows] @ change[rows]), rows.size))
 
 
 def _noise_tests_svg(diagnosis: Diagnosis) -> bytes:

@@ -37,9 +37,8 @@ class Section:
 
 def element(tag: str, *children: str, **attributes: str) -> Markup:
     """Build an element of escaped or `Markup` children; `class_` stands for class, underscores for hyphens."""
-    written = "".join(
-        f' {name.rstrip("_").replace("_", "-")}="{html.escape(value)}"' for name, value in attributes.items()
-    )
+    named = ((name.rstrip("_").replace("_", "-"), html.escape(value)) for name, value in attributes.items())
+    written = "".join(f' {name}="{value}"' for name, value in named)
     return Markup(f"<{tag}{written}>{fragment(*children)}</{tag}>")
 
 

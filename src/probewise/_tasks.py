@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, as_completed
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, as_completed
 from typing import TypeVar
 
 from probewise.errors import LinkError, NotConvergedError
@@ -17,25 +17,27 @@ R = TypeVar("R")
 def results_as_tasks_end(
     work: Callable[[T], R], tasks: Mapping[str, T], executor: Executor | None
 ) -> Iterator[Iterator[tuple[str, R]]]:
-    """Yield an iterator over (key, result), in the order in which tasks end; at exit, cancel tasks not begun."""
+    """Yield an iterator over (key, result), in the order in which tasks end; at exit, cancel tasks not begun.
+
+    It raises NotConvergedError if a worker died, LinkError if the executor dropped its tasks.
+    """
     if executor is None:
         yield ((key, work(task)) for key, task in tasks.items())
         return
-    futures: dict[Future[R], str] = {executor.submit(work, task): key for key, task in tasks.items()}
+    futures = {executor.submit(work, task): key for key, task in tasks.items()}
+
+    def results() -> Iterator[tuple[str, R]]:
+        try:
+            for future in as_completed(futures):
+                yield futures[future], future.result()
+        except CancelledError as error:
+            raise LinkError("the executor dropped its tasks: the connection to its scheduler was lost") from error
+        except BrokenExecutor as error:
+            said = f"a worker died ({error}); finished results are kept, and the same command continues from there"
+            raise NotConvergedError(said) from error
+
     try:
-        yield ((futures[future], _result_of_future(future)) for future in as_completed(futures))
+        yield results()
     finally:
         for future in futures:
             future.cancel()
-
-
-def _result_of_future(future: Future[R]) -> R:
-    """Return a task's result; raise NotConvergedError if its worker died, LinkError if its executor dropped it."""
-    try:
-        return future.result()
-    except CancelledError as error:
-        raise LinkError("the executor dropped its tasks: the connection to its scheduler was lost") from error
-    except BrokenExecutor as error:
-        raise NotConvergedError(
-            f"a worker died ({error}); finished results are kept, and the same command continues from there"
-        ) from error

@@ -266,9 +266,8 @@ class SimulatedBench:
         stand = self.stand()
         across = (mark_mm[0] - stand.x_mm, mark_mm[1] - stand.y_mm)
         gap_mm = stand.height_mm - block_mm
-        words = [
-            f"{axis} {round(2 * off) / 2:g}" for axis, off in zip("xy", across, strict=True) if abs(off) > _SEEN_MM
-        ]
+        off_mm = [(axis, off) for axis, off in zip("xy", across, strict=True) if abs(off) > _SEEN_MM]
+        words = [f"{axis} {round(2 * off) / 2:g}" for axis, off in off_mm]
         if not words and gap_mm <= _SEEN_MM:
             return "ok"
         if gap_mm < -_SEEN_MM:
@@ -354,10 +353,17 @@ def prompter_for_answer(arm: Instrument) -> Callable[[str], str]:
     def ask(text: str) -> str:
         raise_if_stopped()  # an arm may have held the stop back until its reading was kept
         answers: queue.Queue[str] = queue.Queue()
+
+        def read_line() -> None:
+            try:
+                answers.put("" if sys.stdin is None else sys.stdin.readline())
+            except (OSError, ValueError):
+                answers.put("")
+
         with tqdm.external_write_mode(file=sys.stderr):  # a progress bar would overwrite the question
             write_to_terminal(sys.stderr, text)
             # Reading a line cannot be interrupted, so it runs in a daemon thread.
-            threading.Thread(target=lambda: answers.put(_read_line()), daemon=True).start()
+            threading.Thread(target=read_line, daemon=True).start()
             answer = None
             while answer is None:
                 try:
@@ -371,13 +377,6 @@ def prompter_for_answer(arm: Instrument) -> Callable[[str], str]:
     return ask
 
 
-def _read_line() -> str:
-    try:
-        return "" if sys.stdin is None else sys.stdin.readline()
-    except (OSError, ValueError):
-        return ""
-
-
 def confirm_lowering(chosen: ArmName, arm: Instrument, geometry: Geometry | None) -> None:
     """Warn if the sensor may hit the table; let a person who can watch confirm each step of the first lowering."""
     if geometry is None or not chosen.may_differ_from_geometry or not isinstance(arm, LegoArm):
@@ -388,10 +387,8 @@ def confirm_lowering(chosen: ArmName, arm: Instrument, geometry: Geometry | None
 
 
 def confirm_each_step_down(arm: LegoArm) -> None:
-    ask = prompter(arm)
-    arm.first_down = lambda height_mm: ask(
-        f"check that the sensor is {height_mm:.0f} mm above the table, and free to be lowered further"
-    )
+    ask, free = prompter(arm), "above the table, and free to be lowered further"
+    arm.first_down = lambda height_mm: ask(f"check that the sensor is {height_mm:.0f} mm {free}")
 
 
 def warn_if_clearance_doubtful(geometry: Geometry) -> None:
@@ -399,11 +396,9 @@ def warn_if_clearance_doubtful(geometry: Geometry) -> None:
     doubt_mm = geometry.max_height_error_mm
     if doubt_mm < geometry.read_height_mm:
         return
-    known = (
-        "home angles of both links that are 2 degrees off cost up to"
-        if geometry.accuracy is None
-        else "by its [accuracy] the arm may hang lower by"
-    )
+    known = "by its [accuracy] the arm may hang lower by"
+    if geometry.accuracy is None:
+        known = "home angles of both links that are 2 degrees off cost up to"
     print_warning(
         f"the sensor may touch the table: it reads {geometry.read_height_mm:g} mm above it, and {known} "
         f"{doubt_mm:.0f} mm; fit the geometry (probewise arm fit-geometry), or look how it comes down "

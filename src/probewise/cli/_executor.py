@@ -93,7 +93,11 @@ def worker_pool(n: int) -> Iterator[ProcessPoolExecutor]:
     """
     for name in THREAD_VARIABLES:
         os.environ.setdefault(name, "1")
-    _start_tracker_without_hangups()
+    if hasattr(signal, "SIGHUP") and threading.current_thread() is threading.main_thread():
+        # The process that tracks shared resources outlives a closed terminal, without complaints.
+        before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        resource_tracker.ensure_running()
+        signal.signal(signal.SIGHUP, before)
     pool = ProcessPoolExecutor(n, mp_context=multiprocessing.get_context("spawn"), initializer=_initialise_worker)
     try:
         yield pool
@@ -106,14 +110,6 @@ def worker_pool(n: int) -> Iterator[ProcessPoolExecutor]:
             raise NotConvergedError(why) from error
         raise
     pool.shutdown()
-
-
-def _start_tracker_without_hangups() -> None:
-    """Start the process that tracks shared resources so that it outlives a closed terminal, without complaints."""
-    if hasattr(signal, "SIGHUP") and threading.current_thread() is threading.main_thread():
-        before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
-        resource_tracker.ensure_running()
-        signal.signal(signal.SIGHUP, before)
 
 
 def _initialise_worker() -> None:

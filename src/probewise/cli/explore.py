@@ -64,8 +64,12 @@ def run(arguments: argparse.Namespace) -> int:
     kept_message = partial(
         message_to_resume, journal, lambda: len(read_journal(journal).entries), "reading", arguments, "--resume"
     )
+    try:
+        sensor_file = Path(os.path.relpath(arguments.sensor, out)).as_posix()
+    except ValueError:  # on another drive
+        sensor_file = str(arguments.sensor.absolute())
     about = {
-        **experiments.sensor_entry(search.sensor, _path_relative_to_folder(out, arguments.sensor)),
+        **experiments.sensor_entry(search.sensor, sensor_file),
         **experiments.geometry_entry(search.geometry),
         **about_truth,
         "arm": arguments.arm.partition(":")[0],
@@ -240,14 +244,14 @@ class Search:
             drawn = self.drawings.draw(name, drawer)
             return drawn and self.drawings.draw(name, lambda: self.write(name, drawn))  # a full disk ends no search
 
-        self.frames.append(draw_and_write(f"frames/{step.number:03d}.png", lambda: self._draw_frame(step, shadow)))
-        if self.arguments.live and draw_and_write("live.html", lambda: self._live_page(step)) and step.number == 1:
-            webbrowser.open((self.out / "live.html").absolute().as_uri())
+        def live_page() -> bytes:
+            trust, earlier = self.experiment.trust, self.steps[:-1]
+            page = report.live_page_html(step, self.frames[-1], earlier=earlier, trust=trust, draw=self.drawings.draw)
+            return page.encode("utf-8", "backslashreplace")
 
-    def _live_page(self, step: Step) -> bytes:
-        trust, earlier = self.experiment.trust, self.steps[:-1]
-        page = report.live_page_html(step, self.frames[-1], earlier=earlier, trust=trust, draw=self.drawings.draw)
-        return page.encode("utf-8", "backslashreplace")
+        self.frames.append(draw_and_write(f"frames/{step.number:03d}.png", lambda: self._draw_frame(step, shadow)))
+        if self.arguments.live and draw_and_write("live.html", live_page) and step.number == 1:
+            webbrowser.open((self.out / "live.html").absolute().as_uri())
 
     def _draw_frame(self, step: Step, shadow: Step | None) -> bytes:
         means = self.sensor.mean()
@@ -354,11 +358,3 @@ def parse_truth(
     wanted = shape.prior.names
     require(len(theta) == len(wanted), option, text, f"{len(wanted)} numbers, {','.join(wanted)}")
     return HiddenShape.from_parameters(name, shape, theta, called=f"{option} {text}")
-
-
-def _path_relative_to_folder(folder: Path, path: Path) -> str:
-    """Return a file's path relative to a folder; the absolute path if it is on another drive."""
-    try:
-        return Path(os.path.relpath(path, folder)).as_posix()
-    except ValueError:  # on another drive
-        return str(path.absolute())

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise._words import count_with_noun
 from probewise._writing import checked_output_file
 from probewise.cli._common import CommandError, note_if_replaced, say
 from probewise.cli._inputs import read_or_shipped_geometry, read_or_shipped_plan, tables_and_descriptions
@@ -32,16 +33,14 @@ def run(arguments: argparse.Namespace) -> int:
     earlier = note_if_replaced(out)
     write_bytes_atomically(out, drawn)
     for sheet in to_draw:
-        n = len(sheets.tiles_of(sheet, paper))
-        width, height = sheet.size_mm
-        pages = f"{n} page{'s' if n > 1 else ''}"
+        pages, (width, height) = count_with_noun(len(sheets.tiles_of(sheet, paper)), "page"), sheet.size_mm
         say(arguments, f"{sheet.name:<12} {width:g} x {height:g} mm, {pages}: {sheet.lines[0]}")
     say(arguments, *earlier, f"print at 100 % on {paper}, and measure the ruler: {out}")
     return 0
 
 
 def _sheets_to_draw(arguments: argparse.Namespace) -> tuple[sheets.Sheet, ...]:
-    what = arguments.what
+    what, target = arguments.what, arguments.target
     if what not in (FIELD, TARGET):
         refuse_options(arguments, f"{what}: it is for {FIELD} and {TARGET}", "target")
     if what in (FIELD, TARGET, MARKS, JIG):
@@ -50,14 +49,12 @@ def _sheets_to_draw(arguments: argparse.Namespace) -> tuple[sheets.Sheet, ...]:
             return (sheets.marks_sheet(geometry),)
         if what == JIG:
             return (sheets.arm_home_jig_sheet(geometry),)
-        if arguments.target is None:
-            if what == TARGET:
-                raise CommandError("--target is missing: give a shape, such as --target circle:524,260,80")
-            return (sheets.field_sheet(geometry.field_mm, None),)
-        outline = _target_outline_mm(arguments.target, geometry.field_mm)
+        outline = None if target is None else _target_outline_mm(target, geometry.field_mm)
         if what == FIELD:
             return (sheets.field_sheet(geometry.field_mm, outline),)
-        return (sheets.target_sheet(arguments.target, outline),)
+        if outline is None:
+            raise CommandError("--target is missing: give a shape, such as --target circle:524,260,80")
+        return (sheets.target_sheet(target, outline),)
     refuse_options(arguments, f"a plan: it is for {FIELD}, {MARKS} and {JIG}", "geometry")
     path = Path(what)
     if path.suffix.lower() == ".json":

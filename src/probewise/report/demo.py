@@ -19,7 +19,7 @@ from probewise.report import calibration as calibration_report
 from probewise.report import diagnosis as diagnosis_report
 from probewise.report.diagnosis_figures import before_and_after
 from probewise.report.exploration import draw_view_after, draw_widths_and_information
-from probewise.report.html import Markup, Section, element, figures, page, paragraph, table
+from probewise.report.html import Section, element, figures, page, paragraph, table
 from probewise.report.plots.apparatus import draw_arm_lengths
 from probewise.report.plots.canvas import PAGE_IN, AxesGrid, grid_of_axes, png
 from probewise.report.plots.probabilities import effect_probabilities_by_reading
@@ -207,26 +207,23 @@ def page_html(run: DemoRun, drawn: Mapping[str, bytes], *, seconds: float) -> st
         table(_HEADER, _comparison_rows(run.searches)),
         shown["progress.png"],
     )
+    link = element("a", "the full report of the diagnosis", href="diagnosis/report.html")
+    diagnosed = (
+        diagnosis_report.summary_sentence(run.diagnosis),
+        f"The simulated world that made this recording concealed: {run.concealed.replace('_', ' ')}. The diagnosis did "
+        "not know that.",
+        shown["before_after.png"],
+        paragraph("Probabilities, held-out readings, aliased effects and what to measure next: ", link, "."),
+    )
     sections = [
         Section("The sensor", (_SENSOR, calibration_report.summary_sentence(sensor)), of_sensor),
         Section("The search", searching),
-        _diagnosis_section(run.diagnosis, shown, run.concealed),
+        Section("A mismatch, found and repaired", diagnosed),
         doubt_section(run.doubt, drawn, white=sensor.mean()["I_max"]),
         Section("This run", (facts,)),
     ]
     title, answer = "Modeling a sensor to improve its efficacy", summary_sentence(run.searches)
     return page(title, answer=answer, key_figure=shown["equal_readings.png"], sections=sections)
-
-
-def _diagnosis_section(diagnosis: Diagnosis, shown: Mapping[str, Markup], concealed: str) -> Section:
-    said = (
-        f"The simulated world that made this recording concealed: {concealed.replace('_', ' ')}. The diagnosis did "
-        "not know that."
-    )
-    link = element("a", "the full report of the diagnosis", href="diagnosis/report.html")
-    more = paragraph("Probabilities, held-out readings, aliased effects and what to measure next: ", link, ".")
-    summary = diagnosis_report.summary_sentence(diagnosis)
-    return Section("A mismatch, found and repaired", (summary, said, shown["before_after.png"], more))
 
 
 def doubt_sentence(searches: Mapping[str, Exploration]) -> str:

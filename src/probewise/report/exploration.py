@@ -114,11 +114,6 @@ def draw_last_view(run: Exploration) -> Axes:
     return ax
 
 
-def frame_png(run: Exploration, number: int) -> bytes:
-    """Draw the robot's view after the reading of this number, from 1; return a PNG."""
-    return robot_view_png(run.steps[number - 1], run.experiment, **_seen(run, number))
-
-
 def _seen(run: Exploration, number: int) -> dict[str, Any]:
     """Return the first readings of a run, their lowest and highest level, and the true outline if it is known."""
     readings, values = run.readings[:number], [r.value for r in run.readings]
@@ -360,7 +355,11 @@ def output_of(value: Exploration, *, seed: int | None = None) -> Output:
     The sensor is the run's, with the effect that was found in it, if any; not what was learnt along.
     """
     known = None if value.hidden is None else value.hidden.parameters_by_hypothesis_name(value.experiment.names)
-    frame = cache(partial(frame_png, value))  # the animation has them too
+
+    @cache  # the animation has them too
+    def frame(number: int) -> bytes:
+        return robot_view_png(value.steps[number - 1], value.experiment, **_seen(value, number))
+
     frames = {f"frames/{k:03d}.png": partial(frame, k) for k in range(1, len(value.steps) + 1)}
 
     def write_files(stage: StagedFiles) -> None:

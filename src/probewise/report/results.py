@@ -83,9 +83,9 @@ _OUTPUTS: dict[type, Callable[..., Output]] = {
 
 def drawing_of(value: object) -> Axes | AxesGrid:
     """Draw a result's main picture; return its axes. ParameterError if a result of this type has none."""
-    if (kind := _kind_in(_DRAWINGS, value)) is None:
+    if (made := _drawing_and_caption(value)) is None:
         raise ParameterError("result", value, f"one with a picture: {', '.join(k.__name__ for k in _DRAWINGS)}")
-    drawn = _DRAWINGS[kind][0](value)
+    drawn = made[0](value)
     with text_as_it_is(figure_of(drawn)):
         return drawn
 
@@ -93,9 +93,9 @@ def drawing_of(value: object) -> Axes | AxesGrid:
 def html_of(value: object) -> str:
     """Return a result as an HTML fragment: its summary, and its main picture if its type has one."""
     said = element("pre", str(value))
-    if (kind := _kind_in(_DRAWINGS, value)) is None:
+    if (made := _drawing_and_caption(value)) is None:
         return said
-    draw, caption = _DRAWINGS[kind]
+    draw, caption = made
     return element("div", said, figure(png(draw(value), dpi=_DPI), caption))
 
 
@@ -119,5 +119,5 @@ def _output_of(value: object, seed: int | None) -> Output:
     return make(value, seed=None if seed is None else checked_whole("seed", seed, least=0, most=None))
 
 
-def _kind_in(known: dict[type, Any], value: object) -> type | None:
-    return next((kind for kind in type(value).__mro__ if kind in known), None)
+def _drawing_and_caption(value: object) -> tuple[Callable[[Any], Axes | AxesGrid], str] | None:
+    return next((_DRAWINGS[kind] for kind in type(value).__mro__ if kind in _DRAWINGS), None)

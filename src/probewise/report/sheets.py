@@ -52,11 +52,6 @@ class Sheet:
     orientations_rad: tuple[float, ...] = ()  # of the sensor over the sheet
 
     @property
-    def is_pattern(self) -> bool:
-        """Whether it is a pattern to be laid under the arm, where the recording's origin is."""
-        return self.frame == PATTERN_FRAME
-
-    @property
     def size_mm(self) -> tuple[float, float]:
         """Width and height, in mm."""
         return self.high_mm[0] - self.low_mm[0], self.high_mm[1] - self.low_mm[1]
@@ -98,8 +93,7 @@ def tiles_of(sheet: Sheet, paper: str) -> tuple[Tile, ...]:
         ways.append((counts, page))
     (n_columns, n_rows), page = min(ways, key=lambda way: way[0][0] * way[0][1])
     if n_columns * n_rows > _MOST_PAGES:
-        w, h = sheet.size_mm
-        found = f"{w:g} x {h:g} mm, {n_columns * n_rows} pages"
+        found = f"{sheet.size_mm[0]:g} x {sheet.size_mm[1]:g} mm, {n_columns * n_rows} pages"
         raise ParameterError(sheet.name, found, f"a sheet of {_MOST_PAGES} pages at most")
     x_mm = np.linspace(sheet.low_mm[0], sheet.high_mm[0], n_columns + 1).tolist()
     y_mm = np.linspace(sheet.low_mm[1], sheet.high_mm[1], n_rows + 1).tolist()
@@ -135,7 +129,7 @@ def pattern_sheets(patterns: Mapping[str, Pattern], plan: Plan | None = None) ->
     return tuple(sheets)
 
 
-def field_sheet(field_mm: tuple[float, float], outline_mm: FloatArray | None = None) -> Sheet:
+def field_sheet(field_mm: tuple[float, float], outline_mm: FloatArray | None) -> Sheet:
     """Make the sheet of the field: black, with the target white inside its closed outline, (n, 2); None: all black."""
     pattern: Pattern = Uniform(0.0)
     if outline_mm is not None:

@@ -24,6 +24,7 @@ from probewise.report.sheets import (
     LEFT_MM,
     OVERLAP_MM,
     PAPERS_MM,
+    PATTERN_FRAME,
     Sheet,
     Tile,
     lines_of_crosses,
@@ -94,7 +95,7 @@ def _draw_cover_page(batch: Sequence[Any], paper: str, title: str, number: str) 
     page = PAPERS_MM[paper]
     ax = _new_page_axes(page)
     lines = [*_PRINT, *(_GLUE if any(len(tiles) > 1 for (_, tiles), _ in batch) else ())]
-    lines += _LAY if any(sheet.is_pattern for (sheet, _), _ in batch) else _PLACES
+    lines += _LAY if any(sheet.frame == PATTERN_FRAME for (sheet, _), _ in batch) else _PLACES
     for (sheet, tiles), first in batch:
         (width, height), last = sheet.size_mm, first + len(tiles) - 1
         pages = f"page {first}"
@@ -108,7 +109,7 @@ def _draw_cover_page(batch: Sequence[Any], paper: str, title: str, number: str) 
             lines.append(f"the sensor stands at {turns} degrees")
     ax.text(LEFT_MM, page[1] - 18.0, title, fontsize=_LARGE)
     ax.text(LEFT_MM, page[1] - 26.0, "\n".join(lines), fontsize=_USUAL, va="top", linespacing=1.4)
-    _draw_ruler(ax, LEFT_MM, 11.0)
+    _draw_ruler(ax, 11.0)
     ax.text(page[0] - 12.0, 8.5, number, fontsize=_SMALL, ha="right")
     return ax.figure  # type: ignore[return-value]
 
@@ -135,7 +136,7 @@ def _draw_page(sheet: Sheet, tiles: Sequence[Tile], tile: Tile, first: int, numb
             mark(axis, at, f"{value:.4g} mm" if abs(value) > _APART_MM else "")  # else two texts would touch
         if low[axis] <= 0 <= high[axis]:
             mark(axis, near[axis] - low[axis], f"{name} = 0", gap=0.5, lw=1.2, color=VERMILLION)
-    _draw_ruler(ax, LEFT_MM, 6.5)
+    _draw_ruler(ax, 6.5)
     place = f", {number}, column {tile.column + 1}, row {tile.row + 1}" if len(tiles) > 1 else ""
     title = f"{sheet.name}{place}: {sheet.lines[0]}"
     ax.text(LEFT_MM + 3.0, tile.page_mm[1] - 6.0, title, fontsize=_USUAL, va="center")
@@ -151,12 +152,12 @@ def _draw_page(sheet: Sheet, tiles: Sequence[Tile], tile: Tile, first: int, numb
     return ax.figure  # type: ignore[return-value]
 
 
-def _draw_ruler(ax: Axes, x_mm: float, y_mm: float) -> None:
-    ax.plot([x_mm, x_mm + _RULER_MM], [y_mm, y_mm], color=BLACK, lw=0.5, solid_capstyle="butt", gid="ruler")
+def _draw_ruler(ax: Axes, y_mm: float) -> None:
+    ax.plot([LEFT_MM, LEFT_MM + _RULER_MM], [y_mm, y_mm], color=BLACK, lw=0.5, solid_capstyle="butt", gid="ruler")
     for mm in range(0, _RULER_MM + 1, 5):
         length = 3.0 if mm % 50 == 0 else 2.0 if mm % 10 == 0 else 1.2
-        ax.plot([x_mm + mm] * 2, [y_mm, y_mm + length], color=BLACK, lw=0.4, solid_capstyle="butt")
-    ax.text(x_mm + _RULER_MM + 3.0, y_mm + 1.0, "100 mm", fontsize=_SMALL, va="center")
+        ax.plot([LEFT_MM + mm] * 2, [y_mm, y_mm + length], color=BLACK, lw=0.4, solid_capstyle="butt")
+    ax.text(LEFT_MM + _RULER_MM + 3.0, y_mm + 1.0, "100 mm", fontsize=_SMALL, va="center")
 
 
 def _draw_sheet_part(ax: Axes, sheet: Sheet, low_mm: Any, high_mm: Any, place: Any, clip: Any) -> None:
@@ -177,8 +178,7 @@ def _draw_sheet_part(ax: Axes, sheet: Sheet, low_mm: Any, high_mm: Any, place: A
         drawn.set_clip_path(clip)
     crosses = [] if sheet.crosses_mm is None else sheet.crosses_mm.tolist()
     names = sheet.cross_names or [f"{k}: ({x:g}, {y:g})" for k, (x, y) in enumerate(crosses, start=1)]
-    beside = [(x + 10.0, y + 10.0, name) for (x, y), name in zip(crosses, names, strict=True)]
-    for x, y, words in beside:
+    for (x, y), words in zip((np.array(crosses) + 10.0).tolist(), names, strict=True):
         if (low_mm[0] <= x < high_mm[0]) and (low_mm[1] <= y < high_mm[1]):
             at_x, at_y = place(np.array([[x, y]]))[0].tolist()
             fits = at_x + _LETTER_MM * len(words) < place(np.array([high_mm]))[0, 0]

@@ -43,8 +43,8 @@ from probewise.errors import NotConvergedError
 from probewise.nested import Weighted
 from probewise.nested.importance import weighted_draws
 from probewise.nested.weights import (
+    largest_power,
     n_effective,
-    power_bracket,
     resampled_rows,
     student_t_draws,
     student_t_log_norm,
@@ -659,7 +659,7 @@ def _next_beta(gain: FloatArray, beta: float) -> float:
     enough = _EFFECTIVE * np.count_nonzero(np.isfinite(gain))
     if n_effective((1.0 - beta) * gain) >= enough:
         return 1.0
-    low, _ = power_bracket(lambda power: (power - beta) * gain, beta, 1.0, wanted=enough, n_steps=30)
+    low = largest_power(lambda power: (power - beta) * gain, beta, wanted=enough)
     return min(max(low, beta + _LEAST_STEP), 1.0)
 
 

@@ -33,7 +33,7 @@ from probewise.nested import (
     run,
 )
 from probewise.nested.importance import evenly_weighted
-from probewise.nested.weights import n_effective, power_bracket, resampled_rows
+from probewise.nested.weights import largest_power, n_effective, resampled_rows
 from probewise.priors import Prior
 
 _SURPRISED = 12.5  # nats by which even the best sample misses the last reading: five sds of Gaussian noise
@@ -451,7 +451,7 @@ def _next_power(log_weight: FloatArray, base: FloatArray, now: _EvaluatedSamples
     def log_weights_at(power: float) -> FloatArray:
         return _updated_log_weights(log_weight, now.log_likelihood_at_power(power), base)
 
-    low, _ = power_bracket(log_weights_at, power, 1.0, wanted=enough, n_steps=30)
+    low = largest_power(log_weights_at, power, wanted=enough)
     return max(low, power + 1e-6)
 
 

@@ -107,7 +107,9 @@ class SliceChains:
         (n_chains, n_steps), n_params = kinds.shape, self._line.shape[1]
         self._kinds = kinds
         self._frames = _random_orthonormal_directions(kinds == FRAME, n_params, rng)
-        self._axes = _axis_numbers_in_random_order(n_chains, n_steps, n_params, rng)
+        # Axes in random order, without repetition until all were used.
+        turns = rng.random((n_chains, -(-n_steps // n_params), n_params))
+        self._axes = np.argsort(turns, axis=2).reshape(n_chains, -1)[:, :n_steps]
         active = np.arange(n_chains)
         self._begin_step(active, rng)
         while active.size:
@@ -146,12 +148,18 @@ class SliceChains:
 
     def _draw_candidates(self, rows: IntArray, rng: np.random.Generator) -> _Candidates:
         """Draw the next candidates of the chains `rows`, and shrink their brackets as if all were rejected."""
+        # A rejection shrinks the bracket whatever the likelihood was, so candidates can be drawn ahead and evaluated
+        # together: the chain is the same, at the cost of a few evaluations for full batches.
         n_ahead = min(_MOST_AHEAD, max(1, len(self._step) // (2 * rows.size)))
-        t, below, above = _draw_candidates_ahead(self._low[rows], self._high[rows], n_ahead, rng)
+        below, above, t = self._low[rows], self._high[rows], np.empty((rows.size, n_ahead))
+        for k in range(n_ahead):
+            t[:, k] = here = below + (above - below) * rng.random(rows.size)
+            ahead = here > 0
+            below, above = np.where(ahead, below, here), np.where(ahead, here, above)
         self._low[rows], self._high[rows] = below, above
         chain = rows.repeat(n_ahead)
-        ahead = self._now.u.take(rows, axis=0)[:, None, :] + t[:, :, None] * self._line.take(rows, axis=0)[:, None, :]
-        u = self._wrapped(ahead.reshape(-1, self._line.shape[1]), self._cut)
+        u = self._now.u.take(rows, axis=0)[:, None, :] + t[:, :, None] * self._line.take(rows, axis=0)[:, None, :]
+        u = self._wrapped(u.reshape(-1, self._line.shape[1]), self._cut)
         if self._walls is not None:
             np.clip(u, *self._walls, out=u)
         possible, hop = np.ones(chain.size, dtype=bool), np.zeros(rows.size, dtype=bool)
@@ -213,23 +221,6 @@ class SliceChains:
         return np.asarray(delivered | candidates.hop | candidates.shrunk)
 
 
-def _draw_candidates_ahead(
-    low: FloatArray, high: FloatArray, n_ahead: int, rng: np.random.Generator
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Draw the next candidates on each line as if all before were rejected, in units of the line, (n, n_ahead).
-
-    Also return the ends of the bracket if all are rejected, (n,) each. A rejection shrinks the bracket whatever the
-    likelihood was, so candidates can be drawn ahead and evaluated together: the chain is the same, at the cost of a few
-    evaluations for full batches.
-    """
-    t = np.empty((len(low), n_ahead))
-    for k in range(n_ahead):
-        t[:, k] = here = low + (high - low) * rng.random(len(low))
-        ahead = here > 0
-        low, high = np.where(ahead, low, here), np.where(ahead, here, high)
-    return t, low, high
-
-
 def _random_orthonormal_directions(needed: BoolArray, n_params: int, rng: np.random.Generator) -> FloatArray:
     """Draw rows of random orthogonal matrices where `needed`, (n_chains, n_steps), is true.
 
@@ -242,12 +233,6 @@ def _random_orthonormal_directions(needed: BoolArray, n_params: int, rng: np.ran
     used = np.logical_or.reduceat(needed, first, axis=1)
     frames[used] = np.linalg.qr(frames[used])[0]
     return frames.reshape(n_chains, first.size * n_params, n_params)
-
-
-def _axis_numbers_in_random_order(n_chains: int, n_steps: int, n_params: int, rng: np.random.Generator) -> IntArray:
-    """Draw axis numbers, (n_chains, n_steps), in random order without repetition until all were used."""
-    n_turns = -(-n_steps // n_params)
-    return np.argsort(rng.random((n_chains, n_turns, n_params)), axis=2).reshape(n_chains, -1)[:, :n_steps]
 
 
 def _random_bracket(

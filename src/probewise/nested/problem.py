@@ -100,15 +100,6 @@ class _NormalScores:
         return rng.standard_normal((n, len(self.prior.names)))
 
 
-def space_of(prior: Prior, periodic: Sequence[str] = ()) -> Space:
-    """Return the sampling coordinates: the prior's, if it has any, else the unit cube; ParameterError by `periodic`."""
-    if hasattr(prior, "coordinates"):
-        require(not periodic, "periodic", tuple(periodic), "none: the prior has coordinates of its own")
-        return Space(prior, prior.coordinates)
-    require(set(periodic) <= set(prior.names), "periodic", tuple(periodic), f"names among {prior.names}")
-    return Space(prior, None, tuple(prior.names.index(name) for name in periodic))
-
-
 def unbounded_space_of(prior: Prior) -> Space:
     """Return unbounded coordinates, the prior's, else normal scores; ParameterError without `to_unit_cube` either."""
     if hasattr(prior, "coordinates"):
@@ -207,8 +198,12 @@ class Evaluator:
         allowed = "a value with a prior and a log_likelihood(theta), such as inference.SensorProblem"
         require_like("problem", self.problem, ("prior", "log_likelihood"), allowed)
         require_prior("problem.prior", self.problem.prior)
-        self.names = self.problem.prior.names
-        self.space = space_of(self.problem.prior, getattr(self.problem, "periodic", ()))
+        prior, periodic = self.problem.prior, tuple(getattr(self.problem, "periodic", ()))
+        self.names = prior.names
+        if hasattr(prior, "coordinates"):
+            require(not periodic, "periodic", periodic, "none: the prior has coordinates of its own")
+        require(set(periodic) <= set(prior.names), "periodic", periodic, f"names among {prior.names}")
+        self.space = Space(prior, getattr(prior, "coordinates", None), tuple(map(prior.names.index, periodic)))
 
     def points_from_known_values(self, theta: FloatArray, log_likelihood: FloatArray, label: FloatArray) -> Points:
         """Make points of hypotheses (n, n_params) whose log likelihood and label, (n,), are known; evaluate nothing."""

@@ -21,25 +21,26 @@ def n_effective(log_weight: FloatArray) -> float:
     return float(weight.sum() ** 2 / (weight @ weight))
 
 
-def power_bracket(
-    log_weight_at: Callable[[float], FloatArray], low: float, high: float, *, wanted: float, n_steps: int
-) -> tuple[float, float]:
-    """Bracket by bisection the largest power whose log weights have an effective sample size of `wanted` or more.
+_BISECTIONS = 30
 
-    Return the ends of the bracket: the weights of the lower one have enough, those of the upper one too few. `low` and
-    `high` must be such ends; `log_weight_at` maps a power, or its log, to log weights, (n,).
+
+def largest_power(log_weight_at: Callable[[float], FloatArray], low: float, *, wanted: float) -> float:
+    """Return, by bisection, the largest power up to 1 whose log weights have an effective size of `wanted` or more.
+
+    The weights of the power `low` have enough, those of 1 too few; `log_weight_at` maps a power to log weights, (n,).
     """
-    for _ in range(n_steps):
+    high = 1.0
+    for _ in range(_BISECTIONS):
         middle = (low + high) / 2
         low, high = (middle, high) if n_effective(log_weight_at(middle)) >= wanted else (low, middle)
-    return low, high
+    return low
 
 
 def tempering_power(log_weight: FloatArray, wanted: float) -> float:
     """Return the largest power up to 1 of weights, (n,), that leaves an effective sample size of `wanted`."""
     if n_effective(log_weight) >= wanted:
         return 1.0
-    return power_bracket(lambda power: power * log_weight, 0.0, 1.0, wanted=wanted, n_steps=30)[0]
+    return largest_power(lambda power: power * log_weight, 0.0, wanted=wanted)
 
 
 def resampled_rows(weight: FloatArray, n: int, rng: np.random.Generator) -> IntArray:

@@ -118,8 +118,8 @@ def checked_covariates(columns: Mapping[str, ArrayLike] | None, n_points: int) -
         "covariates", columns, "what was logged beside the readings, by name: {'temperature_c': [21.3, ...]}"
     )
     for name in columns:
-        if name in (*KNOWN, SESSION):
-            raise ParameterError("covariates", name, "a name that is no column of a recording; see its own argument")
+        allowed = "a name that is no column of a recording; see its own argument"
+        require(name not in (*KNOWN, SESSION), "covariates", name, allowed)
     return {name: numbers_per_reading(name, values, n_points) for name, values in columns.items()}
 
 
@@ -135,7 +135,7 @@ def selected_row_numbers(rows: ArrayLike | slice, n_points: int) -> IntArray:
 
 
 def numeric_covariates_and_notes(
-    columns: Mapping[str, ArrayLike], controls: Sequence[str] = ()
+    columns: Mapping[str, ArrayLike], controls: Sequence[str]
 ) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
     """Return the numeric columns by name, without a recording's own but for `session`, and notes on the others.
 

@@ -241,9 +241,8 @@ def plan_columns(plan: Plan) -> dict[str, Sequence[str]]:
     """Format the rows of a plan as cells by column of its CSV file, in full precision; ParameterError if it cannot."""
     for name in (*plan.scan_names, *plan.pattern_names, *plan.covariates):
         require(name == name.strip() and name.isprintable(), "name", name, _A_NAME)
-    clash = [name for name in plan.covariates if name in (*_KNOWN, SESSION, "")]
-    if clash:
-        raise ParameterError("covariate", clash[0], "a name that is no column of the format")
+    for name in plan.covariates:
+        require(name not in (*_KNOWN, SESSION, ""), "covariate", name, "a name that is no column of the format")
     if np.any(np.diff(plan.scan) < 0):
         raise ParameterError(
             "scan", int(plan.scan[np.argmax(np.diff(plan.scan) < 0) + 1]), "scans in the order they were taken"
@@ -289,9 +288,19 @@ def _write_with_json(plan: Plan, path: Path, columns: dict[str, Sequence[str]]) 
 
 
 def pictures_to_write(patterns: Mapping[str, Pattern], folder: Path) -> dict[Path, bytes]:
-    """Return by path the pictures of patterns, but for those that are in the folder as they are."""
+    """Return by path the pictures of patterns, but for those that are in the folder as they are.
+
+    ParameterError if a file's name is no plain one, or two images that differ share it.
+    """
+    images: dict[str, Image] = {}
+    for name, pattern in patterns.items():
+        if isinstance(pattern, Image):
+            file, is_plain = f"file of patterns[{name!r}]", is_file_name_without_path(pattern.file)
+            require(is_plain, file, pattern.file, "the name of a PNG or .npy file, without a path")
+            same = np.array_equal(images.setdefault(pattern.file, pattern).albedo, pattern.albedo, equal_nan=True)
+            require(same, file, pattern.file, "another file than that of an image which differs")
     content = {}
-    for file, image in _images_by_file(patterns).items():
+    for file, image in images.items():
         picture = folder / file
         with contextlib.suppress(FileError):  # something else is there
             there = read_image(picture)
@@ -299,20 +308,6 @@ def pictures_to_write(patterns: Mapping[str, Pattern], folder: Path) -> dict[Pat
                 continue
         content[picture] = image_bytes(image.albedo, picture.suffix)
     return content
-
-
-def _images_by_file(patterns: Mapping[str, Pattern]) -> dict[str, Image]:
-    """Return the images among patterns by their file's plain name, which two that differ do not share."""
-    images: dict[str, Image] = {}
-    for name, pattern in patterns.items():
-        if not isinstance(pattern, Image):
-            continue
-        file = f"file of patterns[{name!r}]"
-        if not is_file_name_without_path(pattern.file):
-            raise ParameterError(file, pattern.file, "the name of a PNG or .npy file, without a path")
-        if not np.array_equal(images.setdefault(pattern.file, pattern).albedo, pattern.albedo, equal_nan=True):
-            raise ParameterError(file, pattern.file, "another file than that of an image which differs")
-    return images
 
 
 def _read_with_json(path: object, progress: Progress) -> tuple[Plan, FloatArray | None, list[str]]:
@@ -461,10 +456,9 @@ class Prediction(ShowsItself):
             object.__setattr__(self, name, values)
         require_finite("mean", self.mean)
         require_finite("sd", self.sd)
-        if np.isinf(self.log_density).any():
-            raise ParameterError("log_density", math.inf, "finite numbers, or NaN without a reading")
-        if np.any(self.sd <= 0):
-            raise ParameterError("sd", float(self.sd.min()), "greater than 0")
+        is_fine = not np.isinf(self.log_density).any()
+        require(is_fine, "log_density", math.inf, "finite numbers, or NaN without a reading")
+        require((self.sd > 0).all(), "sd", float(self.sd.min(initial=math.inf)), "greater than 0")
 
     def __len__(self) -> int:
         return len(self.plan)

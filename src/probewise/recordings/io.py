@@ -331,27 +331,22 @@ def read_image(path: Path) -> FloatArray:
     """
     content = read_bytes(path, _ALLOWED)
     try:
-        return (_albedo_from_npy if path.suffix.lower() == ".npy" else _albedo_from_png)(io.BytesIO(content))
+        if path.suffix.lower() == ".npy":
+            values = np.load(io.BytesIO(content), allow_pickle=False)
+            is_picture = isinstance(values, np.ndarray) and values.ndim == 2 and values.dtype.kind in "uif"
+            if not is_picture or not 0 < values.size <= _LARGEST_PIXELS or not ((values >= 0) & (values <= 255)).all():
+                raise ValueError(shown(values))
+            return np.asarray(values, dtype=np.float64) / 255.0
+        from PIL import Image as Pillow  # imported here: most recordings have no image
+
+        with Pillow.open(io.BytesIO(content), formats=["PNG"]) as picture:
+            size, is_known = picture.width * picture.height, picture.mode in ("1", "L", "LA", "P", "RGB", "RGBA")
+            if not is_known or size > _LARGEST_PIXELS:
+                raise ValueError(f"{picture.width} x {picture.height} pixels of the mode {picture.mode}")
+            pixels = np.asarray(picture.convert("RGBA"), dtype=np.float64)
+        return np.asarray(pixels[..., :3].mean(axis=-1) / 255.0 * (pixels[..., 3] / 255.0))
     except Exception as error:  # damaged files make Pillow and NumPy raise many kinds
         raise FileError(path, f"no such picture ({message_of(error, kind=False)})", _ALLOWED) from error
-
-
-def _albedo_from_npy(file: io.BytesIO) -> FloatArray:
-    values = np.load(file, allow_pickle=False)
-    is_picture = isinstance(values, np.ndarray) and values.ndim == 2 and values.dtype.kind in "uif" and values.size > 0
-    if not is_picture or values.size > _LARGEST_PIXELS or not ((values >= 0) & (values <= 255)).all():
-        raise ValueError(shown(values))
-    return np.asarray(values, dtype=np.float64) / 255.0
-
-
-def _albedo_from_png(file: io.BytesIO) -> FloatArray:
-    from PIL import Image as Pillow  # imported here: most recordings have no image
-
-    with Pillow.open(file, formats=["PNG"]) as picture:
-        if picture.mode not in ("1", "L", "LA", "P", "RGB", "RGBA") or picture.width * picture.height > _LARGEST_PIXELS:
-            raise ValueError(f"{picture.width} x {picture.height} pixels of the mode {picture.mode}")
-        pixels = np.asarray(picture.convert("RGBA"), dtype=np.float64)
-    return np.asarray(pixels[..., :3].mean(axis=-1) / 255.0 * (pixels[..., 3] / 255.0))
 
 
 def image_bytes(albedo: FloatArray, suffix: str) -> bytes:
@@ -369,8 +364,8 @@ def image_bytes(albedo: FloatArray, suffix: str) -> bytes:
         return out.getvalue()
     require(suffix.lower() == ".png", "image file suffix", suffix, "'.png' or '.npy'")
     grey = np.rint(values)
-    if np.abs(grey - values).max(initial=0.0) > 1e-9:
-        raise ParameterError("image file suffix", suffix, "'.npy' for an albedo that is not in steps of 1/255")
+    in_steps = np.abs(grey - values).max(initial=0.0) <= 1e-9
+    require(in_steps, "image file suffix", suffix, "'.npy' for an albedo that is not in steps of 1/255")
     from PIL import Image as Pillow  # imported here: most recordings have no image
 
     out = io.BytesIO()

@@ -220,13 +220,12 @@ class Plan:
         require_patterns(described)
         code, scan_names = scan_codes_and_names(scan, n_points)
         number = numbers_per_reading("session", 0.0 if session is None else session, n_points)
+        times = np.arange(n_points, dtype=np.float64) if time_s is None else time_s
         return cls(
             x_mm=x,
             y_mm=numbers_per_reading("y_mm", y_mm, n_points),
             orientation_rad=turns,
-            time_s=np.arange(n_points, dtype=np.float64)
-            if time_s is None
-            else numbers_per_reading("time_s", times_to_numbers("time_s", time_s)[0], n_points),
+            time_s=numbers_per_reading("time_s", times_to_numbers("time_s", times)[0], n_points),
             scan=code,
             scan_names=scan_names,
             pattern=pattern_codes(pattern, described, n_points),

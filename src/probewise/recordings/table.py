@@ -143,7 +143,8 @@ class _Layout:
         below = [k for k in full if k > at]
         self.first = next((k for k in below if not _holds_units(rows[k], self.numeric)), at + 1)
         unnamed = mark != "," and len(self.header) + 1 == self.width
-        if unnamed and _count_up([row[0] for row in last if len(row) == self.width]):
+        numbers = parsed_numbers([row[0] for row in last if len(row) == self.width]) if unnamed else None
+        if numbers is not None and len(numbers) > 1 and (np.diff(numbers) == 1).all():  # rows are numbered
             self.header = ["", *self.header]
         self.above, self.units = [rows[k] for k in full if k < at], [rows[k] for k in below if k < self.first]
 
@@ -215,11 +216,6 @@ def _holds_units(row: Sequence[str], numeric: frozenset[int]) -> bool:
     cells = [row[j] for j in numeric if j < len(row)]
     filled = [cell for cell in cells if not is_missing(cell) or set(cell) == {"-"}]  # or a line below the header
     return bool(filled) and not any(_is_value(cell) for cell in filled)
-
-
-def _count_up(cells: Sequence[str]) -> bool:
-    numbers = parsed_numbers(cells)
-    return numbers is not None and len(numbers) > 1 and bool((np.diff(numbers) == 1).all())
 
 
 def _names(row: Sequence[str], wanted: Sequence[str], width: int) -> list[str]:

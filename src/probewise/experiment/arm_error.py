@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from probewise._arrays import FloatArray, IntArray
+from probewise._arrays import FloatArray
 from probewise.arm.geometry import FITTED, Accuracy, Geometry, place_jacobian
 from probewise.arm.instrument import Reading
 from probewise.errors import require
@@ -98,19 +98,15 @@ def _pose_changes_per_error_sd(geometry: Geometry, places_mm: FloatArray, accura
 
     The result is (n_points, 4, n_errors). Raises ParameterError for a place out of the arm's reach.
     """
-    root = _covariance_factor(np.array(accuracy.covariance))
+    covariance = np.array(accuracy.covariance)
+    scale = np.sqrt(np.diagonal(covariance))
+    scale = np.where(scale > 0, scale, 1.0)  # radians and mm: the numbers differ by orders of magnitude
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    root = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
     place = place_jacobian(geometry, places_mm) @ root
     require(np.isfinite(place).all(), "readings", "a place out of the arm's reach", "readings of this arm")
     turned = np.broadcast_to(root[FITTED.index("base home")], place[:, :1].shape)
     return np.concatenate([place, turned], axis=1)
-
-
-def _covariance_factor(covariance: FloatArray) -> FloatArray:
-    """Return a factor, (n, n), of a covariance: the factor times its own transpose is the covariance."""
-    scale = np.sqrt(np.diagonal(covariance))
-    scale = np.where(scale > 0, scale, 1.0)  # radians and mm: the numbers differ by orders of magnitude
-    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    return np.asarray(scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
 def _posterior_mean_shifts(
@@ -129,8 +125,7 @@ def _posterior_mean_shifts(
     likely, columns = shape_and_columns(experiment.shape, likely_shape)
     of_shape = np.arange(n_sensor, n_sensor + len(columns))
     thetas, weights, by_error, by_shape = [], [], [], []
-    kinds = zip(by_kind.kinds, by_kind.particles, by_kind.probability.tolist(), strict=True)
-    for kind, particles, probability in kinds:
+    for kind, particles, probability in zip(by_kind.kinds, by_kind.particles, by_kind.probability, strict=True):
         if probability < _LEAST or kind.shape not in ("", likely_shape):
             continue
         some = particles.weighted.weight > 0
@@ -139,7 +134,13 @@ def _posterior_mean_shifts(
         thetas.append(theta[:, of_shape])
         weights.append(probability * particles.weighted.weight[some])
         by_error.append(_log_likelihood_slopes_by_error(kind, theta, recording, off, dark))
-        by_shape.append(_log_likelihood_slopes_by_shape(kind, theta, recording, of_shape, _STEP_SD * sd[columns]))
+        problem, of_kind = kind.problem(recording), []
+        for column, step in zip(of_shape.tolist(), (_STEP_SD * sd[columns]).tolist(), strict=True):
+            up, down = theta.copy(), theta.copy()
+            up[:, column] += step
+            down[:, column] -= step
+            of_kind.append((problem.log_likelihood(up) - problem.log_likelihood(down)) / (2 * step))
+        by_shape.append(np.stack(of_kind, axis=-1))
     weight = np.concatenate(weights)
     weight /= weight.sum()
     theta, slope, known = (each - weight @ each for each in map(np.concatenate, (thetas, by_error, by_shape)))
@@ -148,19 +149,6 @@ def _posterior_mean_shifts(
     out = np.zeros((len(mean), off.shape[2]))
     out[columns] = (theta * weight[:, None]).T @ (slope - known @ coefficients) - coefficients
     return out
-
-
-def _log_likelihood_slopes_by_shape(
-    kind: HypothesisKind, theta: FloatArray, recording: Recording, columns: IntArray, steps: FloatArray
-) -> FloatArray:
-    """Return each hypothesis's slope of log likelihood by the parameters `columns` of theta, (n_samples, n_columns)."""
-    problem, slopes = kind.problem(recording), []
-    for column, step in zip(columns.tolist(), steps.tolist(), strict=True):
-        up, down = theta.copy(), theta.copy()
-        up[:, column] += step
-        down[:, column] -= step
-        slopes.append((problem.log_likelihood(up) - problem.log_likelihood(down)) / (2 * step))
-    return np.stack(slopes, axis=-1)
 
 
 def _log_likelihood_slopes_by_error(
@@ -178,23 +166,12 @@ def _log_likelihood_slopes_by_error(
         ends = [kind.model.predict(theta, replace(plan, **{name: getattr(plan, name) + way * step})) for way in (1, -1)]
         return np.asarray((ends[0] - ends[1]) / (2 * step))
 
-    by_pose = np.stack(
-        [
-            prediction_slope_by("x_mm", _STEP_MM),
-            prediction_slope_by("y_mm", _STEP_MM),
-            predicted - dark,
-            prediction_slope_by("orientation_rad", _STEP_RAD),
-        ],
-        axis=-1,
-    )
+    of_place = [prediction_slope_by(name, _STEP_MM) for name in ("x_mm", "y_mm")]
+    by_pose = np.stack([*of_place, predicted - dark, prediction_slope_by("orientation_rad", _STEP_RAD)], axis=-1)
     out = np.empty((len(theta), off.shape[2]))
     for error in range(off.shape[2]):
         change = _STEP_SD * np.einsum("skp,kp->sk", by_pose, off[:, :, error])
-        up, down = (
-            checked_log_prob(
-                kind.likelihood, recording.readings[usable], predicted[:, usable] + way * change[:, usable]
-            )
-            for way in (1, -1)
-        )
+        ends = (predicted[:, usable] + way * change[:, usable] for way in (1, -1))
+        up, down = (checked_log_prob(kind.likelihood, recording.readings[usable], end) for end in ends)
         out[:, error] = (up - down) / (2 * _STEP_SD)
     return out

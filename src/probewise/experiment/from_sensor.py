@@ -344,15 +344,12 @@ def naive_levels_from_recording(recording: Recording, sensor: FittedSensor) -> N
 @own_arithmetic
 def naive_levels_from_world(world: World, scale: ReadingScale, *, rng: np.random.Generator) -> Naive:
     """Simulate 20 readings each over a black and a white sheet, for the naive model's levels and sds."""
-    black, white = (
-        np.array(
-            [
-                scale.clip_and_round(world.read(UniformPattern(albedo), 0.0, 0.0, time_s=float(k), rng=rng))
-                for k in range(_N_EACH)
-            ]
-        )
-        for albedo in (0.0, 1.0)
-    )
+
+    def read(albedo: float) -> FloatArray:
+        signals = [world.read(UniformPattern(albedo), 0.0, 0.0, time_s=float(k), rng=rng) for k in range(_N_EACH)]
+        return np.array([scale.clip_and_round(signal) for signal in signals])
+
+    black, white = read(0.0), read(1.0)
     return _naive_from_readings(black, white, scale.step)
 
 

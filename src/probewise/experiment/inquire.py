@@ -287,14 +287,11 @@ def utilities_near_end(
     region = experiment.shape.region(mean[None])
     unseen, shows_far_side = far_side(_places_mm(inputs), inputs.designs.grid, region, readings)
     far = () if unseen is None else (unseen,)
-    rows = _candidate_designs(experiment, inputs, utilities, theta, readings, rng)
-    rows = np.union1d(rows, far).astype(np.int64)
-    plan = _plan_from_arm_to_candidates(inputs, rows, readings)
-    predicted = np.concatenate(
-        [kind.model.predict(some, plan)[:, 1::2] for kind, some in zip(by_kind.kinds, theta, strict=True) if len(some)]
-    )
+    rows = np.union1d(_candidate_designs(experiment, inputs, utilities, theta, readings, rng), far).astype(np.int64)
+    plan, kinds = _plan_from_arm_to_candidates(inputs, rows, readings), list(zip(by_kind.kinds, theta, strict=True))
+    predicted = np.concatenate([kind.model.predict(some, plan)[:, 1::2] for kind, some in kinds if len(some)])
     n_repeats = inputs.designs.n_repeats[inputs.rows[rows]]
-    left_out = np.array([kind.left_out for kind, some in zip(by_kind.kinds, theta, strict=True) for _ in some])
+    left_out = np.array([kind.left_out for kind, some in kinds for _ in some])
     seen = shows_far_side(_places_mm(inputs)[rows])
 
     def map_of(some: IntArray, utility: FloatArray, label: str) -> UtilityMap:
@@ -407,7 +404,12 @@ def expected_bits_about_left_out(
     """
     masks = [left_out == name for name in np.unique(left_out)]
     by_gaussians = _expected_bits_by_gaussians(weight, predicted, masks, readout.noise_sd / math.sqrt(repeats))
-    by_cells = _expected_bits_by_cells(weight, predicted, masks, readout, repeats)
+    # By cells: the entropy of the readings' histogram, less that given each effect.
+    weights = WeightsGivenReading.of(predicted, weight, readout, fine=_CELL_SDS, repeats=repeats)
+    by_cells = entropy_bits(weights.weight_by_cell)
+    for rows in masks:
+        part = float(weight[rows].sum())
+        by_cells -= part * entropy_bits(weights.weighted_sum_by_cell(rows / part))
     return np.asarray(np.maximum(np.minimum(by_gaussians, by_cells), 0.0))
 
 
@@ -437,18 +439,6 @@ def _expected_bits_by_gaussians(
         of_all = most + np.log((p * np.exp(log_density - most[:, None])).sum(axis=1))
         nats += part * (node_weight @ (log_density[:, k] - of_all))
     return np.asarray(nats / math.log(2.0))
-
-
-def _expected_bits_by_cells(
-    weight: FloatArray, predicted: FloatArray, masks: Sequence[BoolArray], readout: Readout, repeats: int
-) -> FloatArray:
-    """Return bits about the left-out effect, (n_designs,): entropy of the readings' histogram, less that given each."""
-    weights = WeightsGivenReading.of(predicted, weight, readout, fine=_CELL_SDS, repeats=repeats)
-    bits = entropy_bits(weights.weight_by_cell)
-    for rows in masks:
-        part = float(weight[rows].sum())
-        bits -= part * entropy_bits(weights.weighted_sum_by_cell(rows / part))
-    return np.asarray(bits)
 
 
 def leaves_far_side(

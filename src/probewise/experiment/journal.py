@@ -111,15 +111,13 @@ def read_journal(path: str | Path) -> Journal:
         raise FileError(path, "no whole first line", f'a journal, whose first line says "format": "{FORMAT}"', row=1)
     settings = _parse_line(path, lines[0], 1)
     if settings.get("format") != FORMAT:
-        raise FileError(
-            path, f"format {shown(settings.get('format'))}", f'"{FORMAT}", the version this package writes', row=1
-        )
+        found, allowed = f"format {shown(settings.get('format'))}", f'"{FORMAT}", the version this package writes'
+        raise FileError(path, found, allowed, row=1)
     entries = [_parse_entry(path, _parse_line(path, line, row), row) for row, line in enumerate(lines[1:], start=2)]
     for row, entry in enumerate(entries, start=2):
         if entry.index != row - 1:
-            raise FileError(
-                path, f"index {shown(entry.index)}", f"{row - 1}: one line per measurement, in order", row=row
-            )
+            allowed = f"{row - 1}: one line per measurement, in order"
+            raise FileError(path, f"index {shown(entry.index)}", allowed, row=row)
     notes: list[str] = []
     n_torn = 0
     if tail:

@@ -99,12 +99,12 @@ def judge(
     if leader.likelihood is experiment.likelihood:  # chi-square is of this noise
         p_value, worst = p_value_and_worst_reading(experiment, samples.weighted, problem)
         if experiment.fit_is_doubtful(p_value):
-            doubt = (
+            notes = (
+                *notes,
                 f"no hypothesis explains the readings: the best has p = {p_value:.1g} and is worst at reading "
                 f"{worst + 1} ({readings[worst].value:g}); the hypothesis space excludes what lies there, or the "
-                "sensor model leaves something out"
+                "sensor model leaves something out",
             )
-            notes = (*notes, doubt)
     target_reached, off = target_reached_and_chance_off(experiment, posterior)
     judged = Judgement(mean, sd, shapes, target_reached, off, p_value, notes, unexplained)
     if largest_sd_mm(experiment.shape.prior.names, sd) < experiment.stop_sd_mm:
@@ -234,9 +234,8 @@ def probability_of_length_off(experiment: Experiment, posterior: Weighted, off_m
     """
     theta, weight = posterior.theta[:, experiment.shape_columns], posterior.weight
     mean, _, _ = shape_moments_and_probabilities(experiment, posterior)
-    lengths = [
-        k for k, name in enumerate(experiment.shape.prior.names) if name.endswith("_mm") and np.isfinite(mean[k])
-    ]
+    names = experiment.shape.prior.names
+    lengths = [k for k, name in enumerate(names) if name.endswith("_mm") and np.isfinite(mean[k])]
     off = (np.abs(theta[:, lengths] - mean[lengths]) > off_mm).any(axis=1)
     if isinstance(experiment.shape, AnyOf):
         which = experiment.shape.shape_index(theta)
@@ -348,15 +347,11 @@ def stop_reason(
             f"there? T{widest_known[1:]}; a journal can be resumed"
         )
     if utilities.is_flat:
-        promise = (
-            "every reading within reach promises the same"
-            if np.count_nonzero(utilities.reachable) > 1
-            else "the only reading within reach promises nothing more"
-        )
-        return (
-            f"{promise}, {utilities.highest_utility:.2g}: none would tell the hypotheses apart that are left; "
-            f"{widest_known}"
-        )
+        promise = "the only reading within reach promises nothing more"
+        if np.count_nonzero(utilities.reachable) > 1:
+            promise = "every reading within reach promises the same"
+        none = f"{utilities.highest_utility:.2g}: none would tell the hypotheses apart that are left"
+        return f"{promise}, {none}; {widest_known}"
     if max_readings is not None and n_readings >= max_readings:
         return f"all {max_readings} readings that it may take are taken; {widest_known}"
     return None

@@ -136,8 +136,8 @@ def kinds_of(
     models: tuple[SensorModel, SensorModel],
     likelihood: Likelihood,
     *,
-    trust: float = 1.0,
-    rivals: Sequence[SensorModelRival] = (),
+    trust: float,
+    rivals: Sequence[SensorModelRival],
 ) -> tuple[HypothesisKind, ...]:
     """Return the kinds of hypotheses of an experiment: for every shape, the sensor model alone and with each rival.
 
@@ -338,10 +338,11 @@ class PosteriorByKind:
         if len(self.kinds) == 1:
             return self.particles[0].weighted
         probability = self.probability
-        some = [k for k, p in enumerate(probability) if p > 0]
+        some = np.flatnonzero(probability > 0)
         parts = [self.particles[k].weighted for k in some]
-        members = [self.kinds[k].member for k in some]
-        theta = np.concatenate([m.to_whole_theta(w.theta, rng) for m, w in zip(members, parts, strict=True)])
+        theta = np.concatenate(
+            [self.kinds[k].member.to_whole_theta(w.theta, rng) for k, w in zip(some, parts, strict=True)]
+        )
         log_weight = np.concatenate([w.log_weight + math.log(probability[k]) for k, w in zip(some, parts, strict=True)])
         weight = np.exp(log_weight)
         errors = np.array([self.particles[k].log_z_error for k in some])

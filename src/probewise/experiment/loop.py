@@ -21,7 +21,7 @@ from probewise._kinds import checked_path, checked_whole, require_kind, require_
 from probewise.arm.carry_out import covariates_with_height
 from probewise.arm.instrument import Instrument, Pose, Reading
 from probewise.arm.own import Measures, as_instrument, require_measures
-from probewise.errors import DoubtfulResultWarning, FileError, LinkError, ParameterError, shown, warn
+from probewise.errors import DoubtfulResultWarning, FileError, LinkError, ParameterError, require, shown, warn
 from probewise.experiment.inquire import (
     ArmReachAndTravel,
     inquire,
@@ -250,11 +250,13 @@ def explore(
     start_s = 0.0
     if before is not None:
         require_same_settings(before, settings)
-        seed = _seed_of_journal(before, seed)
-        if len(before.entries) > max_readings:
-            raise ParameterError(
-                "max_readings", max_readings, f"the {len(before.entries)} readings the journal holds, or more"
-            )
+        key = before.settings.get("spawn_key")
+        if not isinstance(key, list) or not all(isinstance(word, int) and word >= 0 for word in key):
+            allowed = "a list of whole numbers, as explore writes it"
+            raise FileError(before.path, f"spawn_key is {shown(key)}", allowed, row=1)
+        seed = np.random.SeedSequence(seed.entropy, spawn_key=tuple(key))
+        n = len(before.entries)
+        require(n <= max_readings, "max_readings", max_readings, f"the {n} readings the journal holds, or more")
         start_s = before.readings[-1].time_s if before.entries else 0.0
     instrument = as_instrument(instrument, start_s=start_s)
     return _yield_steps(instrument, experiment, seed, max_readings, path=path, before=before, settings=settings)
@@ -373,15 +375,6 @@ def _run_seed(rng: np.random.Generator) -> np.random.SeedSequence:
     return seed.spawn(1)[0]
 
 
-def _seed_of_journal(journal: Journal, seed: np.random.SeedSequence) -> np.random.SeedSequence:
-    """Return the seed of a journal's run, a child of the same parent as `seed`; FileError if the journal has none."""
-    key = journal.settings.get("spawn_key")
-    if not isinstance(key, list) or not all(isinstance(word, int) and word >= 0 for word in key):
-        allowed = "a list of whole numbers, as explore writes it"
-        raise FileError(journal.path, f"spawn_key is {shown(key)}", allowed, row=1)
-    return np.random.SeedSequence(seed.entropy, spawn_key=tuple(key))
-
-
 def _rng_of_reading(seed: np.random.SeedSequence, number: int) -> np.random.Generator:
     """Return the random generator for reading `number`, from 1 (0: before the first)."""
     return np.random.default_rng(np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, number)))
@@ -395,7 +388,7 @@ def _posterior_summary(info: Step, state: ExplorationState) -> PosteriorSummary:
 
 
 def run_from_place(
-    first: Pose, instrument: Instrument, experiment: Experiment, *, rng: np.random.Generator, max_readings: int = 100
+    first: Pose, instrument: Instrument, experiment: Experiment, *, rng: np.random.Generator, max_readings: int
 ) -> Exploration:
     """Run the loop from a given first place, so that two robots with the same first reading can be compared.
 

@@ -15,7 +15,6 @@ from probewise.experiment.evidence import can_suspend_mask, sleeping_mask, to_fi
 from probewise.experiment.kinds import (
     IMPROBABLE,
     SUSPECTED_PROBABILITY,
-    HypothesisKind,
     PosteriorByKind,
     n_samples_of_kind,
 )
@@ -31,6 +30,7 @@ from probewise.inquiry.smc import (
     update,
 )
 from probewise.nested import EvidenceChange, KernelMove, Move, StopRule, Weighted, diversify, run
+from probewise.nested.importance import samples_of_run
 from probewise.nested.weights import resampled_rows
 from probewise.recordings.plan import Recording
 
@@ -151,11 +151,18 @@ class NestedSampling:
 
     def updated(self, previous: PosteriorByKind, recording: Recording, *, rng: np.random.Generator) -> PosteriorByKind:
         """Infer from all readings by a new nested sampling run for each kind of hypotheses."""
-        found = tuple(
-            self._nested_samples(before, kind, recording, rng)
-            for kind, before in zip(previous.kinds, previous.particles, strict=True)
-        )
-        now = replace(previous, particles=found)
+        found = []
+        for kind, before in zip(previous.kinds, previous.particles, strict=True):
+            problem, n_live = kind.problem(recording), self.n_live
+            try:  # without a check, as the robot waits
+                result = run(problem, rng=rng, n_live=n_live, stop=self.stop, move=self.move, max_cost=1.0)
+            except NotConvergedError:  # no hypothesis of this kind could have given the readings
+                found.append(before.with_zero_evidence())
+                continue
+            n_calls = before.weighted.n_calls + result.n_calls
+            samples = replace(samples_of_run(result), n_calls=n_calls, warnings=())
+            found.append(Particles(samples, np.arange(len(samples.theta))))
+        now = replace(previous, particles=tuple(found))
         if not np.isfinite(now.log_odds).any():
             raise NotConvergedError("no hypothesis of any kind could have given these readings")
         return now
@@ -176,24 +183,3 @@ class NestedSampling:
                 moved = diversify(start, kind.problem(recording), rng=rng, n_steps=self.n_steps)
                 drawn.append(kind.member.to_whole_theta(moved, rng))
         return np.concatenate(drawn)
-
-    def _nested_samples(
-        self, before: Particles, kind: HypothesisKind, recording: Recording, rng: np.random.Generator
-    ) -> Particles:
-        """Sample one kind by nested sampling; its evidence is zero if none of its hypotheses is possible."""
-        try:
-            result = run(
-                kind.problem(recording),
-                rng=rng,
-                n_live=self.n_live,
-                stop=self.stop,
-                move=self.move,
-                max_cost=1.0,  # the robot waits
-            )
-        except NotConvergedError:  # no hypothesis of this kind could have given the readings
-            return before.with_zero_evidence()
-        names = ("names", "theta", "log_likelihood", "log_weight", "log_z", "log_z_error", "n_eff")
-        same = {name: getattr(result, name) for name in names}
-        n_calls = before.weighted.n_calls + result.n_calls
-        found = Weighted(**same, n_calls=n_calls, pareto_k=-math.inf, run=result)
-        return Particles(found, np.arange(len(found.theta)))

@@ -192,12 +192,8 @@ def _signal_dependent(
 ) -> FloatArray:
     """Noise that grows with the signal, 0 over black and 1 over white; a node is the growth of its variance."""
     seen = np.clip((predicted - levels[0]) / (levels[1] - levels[0]), 0.0, 1.0)
-    return _log_mean_over_nodes(
-        [
-            noise.log_density(readings, predicted, sd=noise.sd * np.sqrt(1.0 + ratio * seen)).sum(axis=1)
-            for ratio in signal_dependent_noise().prior.from_unit_cube(_NODES)[:, 0].tolist()
-        ]
-    )
+    sds = (noise.sd * np.sqrt(1.0 + k * seen) for k in signal_dependent_noise().prior.from_unit_cube(_NODES)[:, 0])
+    return _log_mean_over_nodes([noise.log_density(readings, predicted, sd=sd).sum(axis=1) for sd in sds])
 
 
 def _flicker(

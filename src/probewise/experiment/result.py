@@ -263,11 +263,9 @@ class Exploration(Reported):
             if np.isfinite(mean)
         ]
         if self.arm_error is not None:
-            own = ", ".join(
-                f"{name} {_number(name, sd, more=1)}"
-                for name, mean, sd in zip(last.names, last.mean, self.arm_error.sd, strict=True)
-                if np.isfinite(mean) and name != "shape"
-            )
+            known = zip(last.names, last.mean, self.arm_error.sd, strict=True)
+            sds = [(name, sd) for name, mean, sd in known if np.isfinite(mean) and name != "shape"]
+            own = ", ".join(f"{name} {_number(name, sd, more=1)}" for name, sd in sds)
             lines.append(f"arm          of these sds its own error makes up {own}: the same for all readings")
         lines += [f"{name:<{width}}  {mean:.3g} ± {sd:.2g} (sensor)" for name, (mean, sd) in last.sensor.items()]
         return "\n".join([*lines, *(f"doubtful: {note}" for note in self.notes)])
@@ -397,10 +395,8 @@ class LeftOutEffects:
 
     def as_json(self) -> dict[str, Any]:
         """Return the entry "left_out" of result.json."""
-        hypotheses = [
-            {"effects": [] if name == CLEAN else name.split("+"), "probability": p}
-            for name, p in self.probability.items()
-        ]
+        effects = {name: [] if name == CLEAN else name.split("+") for name in self.probability}
+        hypotheses = [{"effects": effects[name], "probability": p} for name, p in self.probability.items()]
         return {"hypotheses": hypotheses, "credible_set": list(self.credible_set), "sentence": self.sentence}
 
 

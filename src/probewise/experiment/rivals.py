@@ -91,21 +91,15 @@ def rivals_of(
         plan = _plan_there_and_back(math.hypot(*field_mm) if kind in _OF_WHOLE_FIELD else _SCAN_MM, height_mm)
         effect = kind.for_extent(Extent(min(dark, bright), max(dark, bright), plan))
         if effect is not None and carried.isdisjoint(kind.name.split("+")):
-            rivals.append(SensorModelRival(kind.name, effect=_in_run(effect, field_mm)))
+            in_run = replace(effect, parameters=_prior_for_run(effect, field_mm))
+            if kind.name in OF_MOTION:
+                in_run = from_rest(in_run)
+            elif kind.name in _IN_TIME:
+                in_run = in_paced_time(in_run)
+            rivals.append(SensorModelRival(kind.name, effect=in_run))
     noise = DeclaredNoise.from_likelihood(likelihood)
-    if noise is not None:
-        rivals += [
-            SensorModelRival(name, likelihood=law) for name, law in noise_likelihoods(noise, (dark, bright)).items()
-        ]
-    return tuple(rivals)
-
-
-def _in_run(effect: Effect, field_mm: tuple[float, float]) -> Effect:
-    """Return an effect with a run's prior; one of time acts in paced time, one of motion spares the first reading."""
-    in_run = replace(effect, parameters=_prior_for_run(effect, field_mm))
-    if effect.name in OF_MOTION:
-        return from_rest(in_run)
-    return in_paced_time(in_run) if effect.name in _IN_TIME else in_run
+    laws = {} if noise is None else noise_likelihoods(noise, (dark, bright))
+    return (*rivals, *(SensorModelRival(name, likelihood=law) for name, law in laws.items()))
 
 
 def _plan_there_and_back(length_mm: float, height_mm: float | None) -> Plan:

@@ -140,14 +140,8 @@ def arm_over(
 
     for earlier in taken:
         light(earlier.pose, earlier.time_s, earlier.covariates.get("height_mm", world.height_mm))
-    reach = Reach((field.width_mm, field.height_mm)) if workspace is None else workspace
-    return SimulatedArm(
-        light,
-        reach=reach,
-        scale=ReadingScale() if scale is None else scale,
-        height_mm=world.height_mm,
-        last=taken[-1] if taken else None,
-    )
+    reach, last = workspace or Reach((field.width_mm, field.height_mm)), taken[-1] if taken else None
+    return SimulatedArm(light, reach=reach, scale=scale or ReadingScale(), height_mm=world.height_mm, last=last)
 
 
 Truth = Sequence[float] | Mapping[str, float] | Mapping[str, Sequence[float]] | Mapping[str, Mapping[str, float]]

@@ -171,9 +171,8 @@ def checked_texts(name: str, value: object, allowed: str) -> tuple[str, ...]:
     """
     several = isinstance(value, Sequence | set | frozenset | np.ndarray | Mapping) and getattr(value, "ndim", 1) > 0
     if isinstance(value, str) or not several:
-        raise ParameterError(
-            name, value, f"{allowed}, in a list" + (f": [{value!r}]" if isinstance(value, str) else "")
-        )
+        example = f": [{value!r}]" if isinstance(value, str) else ""
+        raise ParameterError(name, value, f"{allowed}, in a list{example}")
     texts = tuple(checked_text(name, each, allowed) for each in value)  # type: ignore[attr-defined]
     return tuple(sorted(texts)) if isinstance(value, set | frozenset) else texts
 

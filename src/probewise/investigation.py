@@ -334,15 +334,13 @@ def _parse_one_effect(text: str, option: str) -> Concealed:
     name, _, numbers = text.partition(":")
     names_of = {own: inspect.signature(kind).parameters for own, kind in KINDS.items()}
     kinds = {own for own, taken in names_of.items() if {each.annotation for each in taken.values()} == {"float"}}
-    if name not in kinds:
-        allowed = f"{NOTHING}, or an effect of probewise.world.concealed with its values{did_you_mean(name, kinds)}"
-        raise ParameterError(option, name, allowed)
+    allowed = f"{NOTHING}, or an effect of probewise.world.concealed with its values{did_you_mean(name, kinds)}"
+    require(name in kinds, option, name, allowed)
     allowed = f"{name}:{','.join(names_of[name])}, all of them numbers of magnitude up to {_LARGEST:g}"
     try:
         values = [float(number) for number in numbers.split(",")]
         effect: Concealed = KINDS[name](*values)
     except (TypeError, ValueError) as error:
         raise ParameterError(option, text, allowed) from error
-    if not all(abs(value) <= _LARGEST for value in values):  # nor NaN
-        raise ParameterError(option, text, allowed)
+    require(all(abs(value) <= _LARGEST for value in values), option, text, allowed)  # nor NaN
     return effect

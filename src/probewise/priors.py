@@ -317,8 +317,8 @@ class HeavyTailedPrior:
 
     def __post_init__(self) -> None:
         require(0 < self.typical < math.inf, "HeavyTailedPrior(typical)", self.typical, "greater than 0, finite")
-        if not 0 < self.smallest < self.largest:
-            raise ParameterError("HeavyTailedPrior(smallest)", self.smallest, f"0 < smallest < {self.largest:g}")
+        small, allowed = self.smallest, f"0 < smallest < {self.largest:g}"
+        require(0 < small < self.largest, "HeavyTailedPrior(smallest)", small, allowed)
 
     @cached_property
     def component_sds(self) -> FloatArray:

@@ -509,11 +509,10 @@ def _simulator_and_table(
     """Return a simulator, read if it is a file, its tables joined, and notes on them; ParameterError with a sensor."""
     from pathlib import Path
 
-    from probewise.errors import ParameterError
+    from probewise.errors import require
     from probewise.systems import concatenate_tables, read_simulator, table_for
 
-    if sensor is not None:
-        raise ParameterError("sensor", sensor, "None with a simulator, which replaces it")
+    require(sensor is None, "sensor", sensor, "None with a simulator, which replaces it")
     acting = read_simulator(simulator) if isinstance(simulator, str | Path) else simulator
     several = list(tables) if isinstance(tables, list | tuple) else [tables]
     built = [table_for(acting, cast("Table", each)) for each in several]

@@ -309,8 +309,8 @@ def _fit_geometry_to_marks(arguments: argparse.Namespace, geometry: Geometry) ->
 
 def _touch_and_save_marks(arguments: argparse.Namespace, geometry: Geometry, kept: Path) -> None:
     """Bring the sensor to one mark after another as a person directs; save each at once to the file `kept`."""
-    if not _bench.parse_arm(arguments.arm).is_lego:
-        raise ParameterError("--arm", arguments.arm, "nxt:PORT or emulator:TRUE.toml: the arm whose geometry is fitted")
+    allowed = "nxt:PORT or emulator:TRUE.toml: the arm whose geometry is fitted"
+    require(_bench.parse_arm(arguments.arm).is_lego, "--arm", arguments.arm, allowed)
     if kept.exists() and not arguments.resume:
         raise FileError(kept, "the file exists already", "--resume to continue it, or another --marks")
     taken = np.concatenate(read_turns_and_places(kept), axis=1).tolist() if kept.exists() else []

@@ -324,8 +324,8 @@ def _checked_field(text: str | None, geometry: Geometry | None) -> Field:
     if text is None:
         return of_arm or Field()
     field = Field(*parse_finite_numbers("--field", text, 2, "WIDTH,HEIGHT in mm, such as 1048,520"))
-    if of_arm not in (None, field):
-        raise ParameterError("--field", text, f"{of_arm.width_mm:g},{of_arm.height_mm:g}, the geometry's; or none")
+    near = of_arm or field
+    require(near == field, "--field", text, f"{near.width_mm:g},{near.height_mm:g}, the geometry's; or none")
     return field
 
 

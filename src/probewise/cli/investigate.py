@@ -40,8 +40,8 @@ def run(arguments: argparse.Namespace) -> int:
     out = checked_output_directory(arguments.out, "rounds", main="diagnosis.json")
     chosen = benches.parse_arm(arguments.arm)
     simulated = chosen.kind == "simulated"
-    if arguments.truth is not None and not simulated:
-        raise ParameterError("--truth", arguments.truth, f"none with {arguments.arm}: it is for the simulated arm")
+    if not simulated:
+        refuse_options(arguments, f"{arguments.arm}: it is for the simulated arm", "truth")
     idle = {"simulated": ("origin_mm", "geometry"), "file": ("geometry",)}.get(chosen.kind, ())
     refuse_options(arguments, f"{arguments.arm}, which has no use for it", *idle)
     plan = _first_plan(arguments, chosen)

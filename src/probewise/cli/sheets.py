@@ -11,7 +11,7 @@ from probewise._writing import checked_output_file
 from probewise.cli._common import CommandError, note_if_replaced, say
 from probewise.cli._inputs import read_or_shipped_geometry, read_or_shipped_plan, tables_and_descriptions
 from probewise.cli._options import refuse_options
-from probewise.errors import ParameterError, require
+from probewise.errors import require
 from probewise.recordings import write_bytes_atomically
 from probewise.recordings.files import read_description
 from probewise.report import sheets
@@ -73,6 +73,6 @@ def _target_outline_mm(text: str, field_mm: tuple[float, float]) -> FloatArray:
 
     hidden = parse_truth(text, ("circle",), Field(*field_mm), rng=np.random.default_rng(0), option="--target")
     outline = outlines(hidden.shape.region(hidden.theta[None, :]), n_vertices=720)[0]
-    if (outline < 0).any() or (outline > field_mm).any():
-        raise ParameterError("--target", text, f"a shape that lies on the field, {field_mm[0]:g} x {field_mm[1]:g} mm")
+    allowed = f"a shape that lies on the field, {field_mm[0]:g} x {field_mm[1]:g} mm"
+    require(((outline >= 0) & (outline <= field_mm)).all(), "--target", text, allowed)
     return outline

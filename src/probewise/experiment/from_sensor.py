@@ -15,7 +15,7 @@ from probewise.arm import ReadingScale
 from probewise.calibration import FittedSensor
 from probewise.calibration.sensor_file import require_fitted_sensor
 from probewise.effects import Effect, Known
-from probewise.errors import ParameterError, require
+from probewise.errors import require
 from probewise.experiment.method import NestedSampling
 from probewise.experiment.paper import least_sd, student_t_likelihood
 from probewise.experiment.rivals import OF_MOTION, from_rest
@@ -332,12 +332,9 @@ def naive_levels_from_recording(recording: Recording, sensor: FittedSensor) -> N
     share = Chain(mixture, FixedLevels(0.0, 1.0), patterns, n_nodes=FAST_NODES)
     seen = share.predict(np.empty((1, 0)), recording.plan)[0]
     black, white = (recording.readings[recording.usable & (np.abs(seen - albedo) <= _UNIFORM)] for albedo in (0.0, 1.0))
-    if min(black.size, white.size) < 2:
-        raise ParameterError(
-            recording.source or "recording",
-            f"{black.size} readings over black and {white.size} over white",
-            "two or more of each, far from any edge: repeated readings over a black and over a white sheet",
-        )
+    found = f"{black.size} readings over black and {white.size} over white"
+    allowed = "two or more of each, far from any edge: repeated readings over a black and over a white sheet"
+    require(min(black.size, white.size) >= 2, recording.source or "recording", found, allowed)
     return _naive_from_readings(black, white, scale_of(sensor.instrumentation).step)
 
 

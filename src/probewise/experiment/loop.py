@@ -89,13 +89,11 @@ def begin(experiment: Experiment, instrument: Instrument, *, rng: np.random.Gene
     joined = by_kind.joined(rng=rng)
     drawn = joined.samples(experiment.n_samples, rng=rng)
     inputs, utilities = predict_readings_and_utilities(experiment, joined, drawn, reach, at=None, goal=experiment.goal)
-    if utilities.is_flat:
-        raise ParameterError(
-            "utility",
-            f"{utilities.highest_utility:g} everywhere",
-            "one that differs between places: as it is, no reading within reach is expected to tell anything; "
-            "does the field hold the shape's prior, and can the sensor tell the shape from its surroundings?",
-        )
+    allowed = (
+        "one that differs between places: as it is, no reading within reach is expected to tell anything; "
+        "does the field hold the shape's prior, and can the sensor tell the shape from its surroundings?"
+    )
+    require(not utilities.is_flat, "utility", f"{utilities.highest_utility:g} everywhere", allowed)
     pose, *planned = next_poses(experiment, inputs, utilities, rng=rng)
     return ExplorationState((), by_kind, pose, tuple(planned), reach, prior_bits)
 

@@ -79,11 +79,8 @@ def rivals_of(
     that of the sensor above the surface as it was calibrated (None: not known).
     """
     if not isinstance(model, Chain) or not isinstance(model.levels, FixedLevels):
-        raise ParameterError(
-            "trust",
-            "below 1",
-            '1 with a sensor model that is naive, is learnt along, or is one of your own: "--trust 1"',
-        )
+        allowed = '1 with a sensor model that is naive, is learnt along, or is one of your own: "--trust 1"'
+        raise ParameterError("trust", "below 1", allowed)
     dark, bright = model.levels.i_min, model.levels.i_max
     carried = {effect.name for effect in model.effects}
     rivals = []

@@ -17,7 +17,7 @@ from probewise.arm.carry_out import recording_of
 from probewise.arm.geometry import Geometry, place_jacobian
 from probewise.arm.instrument import Reading
 from probewise.calibration.sensor_file import FittedSensor
-from probewise.errors import ParameterError, require
+from probewise.errors import require
 from probewise.experiment.journal import value_digest
 from probewise.experiment.kinds import HypothesisKind, KindProblem, kinds_of
 from probewise.experiment.method import Method, SequentialMonteCarlo
@@ -57,11 +57,10 @@ class FittedArm:
 
     def __post_init__(self) -> None:
         require_kind("geometry", self.geometry, Geometry, "a Geometry, such as read_geometry(path) returns")
-        if self.geometry.accuracy is None:
-            raise ParameterError("geometry", "one without [accuracy]", "one that was fitted to marks")
-        if not _reads_at(self.geometry, self.calibration_place_mm):
-            allowed = "a place within the arm's reach, at which it took the readings of the calibration"
-            raise ParameterError("calibrated_mm", self.calibration_place_mm, allowed)
+        require(self.geometry.accuracy, "geometry", "one without [accuracy]", "one that was fitted to marks")
+        place_mm = self.calibration_place_mm
+        allowed = "a place within the arm's reach, at which it took the readings of the calibration"
+        require(_reads_at(self.geometry, place_mm), "calibrated_mm", place_mm, allowed)
 
     @property
     def calibration_place_mm(self) -> tuple[float, float]:

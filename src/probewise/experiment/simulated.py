@@ -167,8 +167,8 @@ class HiddenShape:
         """
         prior = shape.prior
         values = floats(theta, called)
-        if values.shape != (len(prior.names),):
-            raise ParameterError(called, theta, f"{len(prior.names)} numbers, {', '.join(prior.names)}")
+        n = len(prior.names)
+        require(values.shape == (n,), called, theta, f"{n} numbers, {', '.join(prior.names)}")
         one = np.eye(len(values), dtype=np.bool_)
         with np.errstate(invalid="ignore"):  # of a ratio of infinities
             given = prior.to_unit_cube(values[None])

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from typing import Any, TypeAlias
 
@@ -203,9 +203,8 @@ class InstrumentModel:
         """
         at_once = max(_BLOCK // len(settings), 1)
         if len(theta) > at_once:
-            return np.concatenate(
-                [self.predict(theta[k : k + at_once], settings) for k in range(0, len(theta), at_once)]
-            )
+            parts = (theta[k : k + at_once] for k in range(0, len(theta), at_once))
+            return np.concatenate([self.predict(part, settings) for part in parts])
         out = self.call(theta, settings)
         if not np.isfinite(out).all():
             sample, row = (int(k) for k in np.argwhere(~np.isfinite(out))[0])
@@ -297,9 +296,8 @@ class ReadingsProblem:
         same = np.all([c == last.settings.columns[n][0] for n, c in self.settings.columns.items()], axis=0)
         row = int(np.argmax(same)) if same.any() else len(same)
         settings = self.settings if same.any() else self.settings.joined(last.settings)
-        return replace(
-            self, settings=settings, row=np.append(self.row, row), values=np.append(self.values, last.values)
-        )
+        rows, values = np.append(self.row, row), np.append(self.values, last.values)
+        return ReadingsProblem(self.model, settings, rows, values)
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
         """Return the log likelihood of all readings, (n_samples, n_params) -> (n_samples,)."""
@@ -509,10 +507,8 @@ class Inquiry(ShowsItself):
         """
         value = checked_finite_number("reading", reading, "a finite number; leave out a missing reading")
         if setting is None and self._next is None:
-            way_out = (
-                "the setting of this reading: tell(reading, setting); next() has chosen none since the last reading"
-            )
-            raise ParameterError("setting", None, way_out)
+            way_out = "tell(reading, setting); next() has chosen none since the last reading"
+            raise ParameterError("setting", None, f"the setting of this reading: {way_out}")
         at = self._settings.checked_setting(self._next if setting is None else setting)
         last = ReadingsProblem(self._model, at, np.array([0]), np.array([value]))
         readings = last if self._readings is None else self._readings.with_reading(last)
@@ -662,7 +658,6 @@ def _checked_goal(goal: Mapping[str, float] | None, names: tuple[str, ...]) -> d
         return {}
     require(isinstance(goal, Mapping) and goal, "goal", goal, 'posterior sds by parameter, such as {"centre_hz": 0.5}')
     for name, sd in goal.items():
-        if name not in names:
-            raise ParameterError("goal", name, f"parameters among {', '.join(names)}{did_you_mean(name, names)}")
+        require(name in names, "goal", name, f"parameters among {', '.join(names)}{did_you_mean(name, names)}")
         require(checked_finite_number(f"goal[{name!r}]", sd) > 0, f"goal[{name!r}]", sd, "greater than 0")
     return dict(goal)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from probewise._arrays import FloatArray, IntArray, read_only_floats
 from probewise.effects import Known
-from probewise.errors import ParameterError
+from probewise.errors import require
 from probewise.inquiry.forecast import (
     MOST_PREDICTED,
     DirectForecast,
@@ -145,9 +145,8 @@ class DiscTable:
         x, y, distance = (values.ravel()[near] for values in (away_x, away_y, distance))
         angle = _pseudo_angle(cosine * x + sine * y, cosine * y - sine * x)
         n_bends, n_directions, n_distances = self.levels.shape
-        bend, along_bend = _index_and_fraction(
-            (1.0 / theta[:, 2] - self.bend_per_mm[0]) * self._entries_per_curvature, n_bends
-        )
+        curvature = 1.0 / theta[:, 2] - self.bend_per_mm[0]
+        bend, along_bend = _index_and_fraction(curvature * self._entries_per_curvature, n_bends)
         turn, along_turn = _index_and_fraction(angle * ((n_directions - 1) / 4.0), n_directions)
         step, along = _index_and_fraction((distance + self.margin_mm) * self._entries_per_mm, n_distances)
         corner = (bend[hypothesis] * n_directions + turn) * n_distances + step
@@ -179,7 +178,11 @@ class DiscTable:
         per_level = 1.0 / (levels[1] - levels[0])
         dark, bright = np.rint((np.array([self.dark, self.bright]) - levels[0]) * per_level).astype(np.int64).tolist()
         nearest = np.clip(np.rint((self.levels - levels[0]) * per_level), 0, n_levels - 1).astype(np.int16)
-        margin = self._distance_to_constant_level_mm(nearest, (dark, bright))
+        margin = 0.0  # distance from an edge beyond which the nearest level is constant
+        if self.margin_mm > 0.0:
+            distance = np.linspace(-self.margin_mm, self.margin_mm, nearest.shape[2])
+            off = (nearest != np.where(distance <= 0.0, bright, dark)).any(axis=(0, 1))
+            margin = float(np.abs(distance[off]).max(initial=0.0))
         x, y, radius = _in_single_precision(theta).T
         mass = np.empty((grid.n_places, n_levels))
         turn = turn_rad.reshape(grid.n_y, n_x)
@@ -213,17 +216,6 @@ class DiscTable:
             part[:, dark] += outside
             mass[start * n_x : start * n_x + n_places] = part
         return mass
-
-    def _distance_to_constant_level_mm(self, nearest: IntArray, ends: tuple[int, int]) -> float:
-        """Return the distance from an edge beyond which the nearest level is constant.
-
-        `nearest`: its index for each entry of the table; `ends`: that of the dark and the bright level.
-        """
-        if self.margin_mm == 0.0:
-            return 0.0
-        distance = np.linspace(-self.margin_mm, self.margin_mm, nearest.shape[2])
-        off = (nearest != np.where(distance <= 0.0, ends[1], ends[0])).any(axis=(0, 1))
-        return float(np.abs(distance[off]).max(initial=0.0))
 
     def _nearest_entry_index(
         self, x: FloatArray, y: FloatArray, radius: FloatArray, turn_rad: FloatArray, place: IntArray
@@ -359,10 +351,8 @@ def _readings_outside_and_inside(model: SensorModel, radius_mm: float) -> tuple[
     """Return the readings far outside and at the middle of a disc; raise ParameterError if they are equal."""
     east = np.array([[1.0, 0.0]])
     dark, bright = _readings_around_disc(model, radius_mm, east, np.array([1e4, -radius_mm]))[0]
-    if dark == bright:
-        raise ParameterError(
-            "levels", (dark, bright), "two different levels: a sensor that tells the disc from its surroundings"
-        )
+    allowed = "two different levels: a sensor that tells the disc from its surroundings"
+    require(dark != bright, "levels", (dark, bright), allowed)
     return float(dark), float(bright)
 
 
@@ -400,7 +390,11 @@ class DiscForecast:
         table, grid = self.table, designs.grid
         levels = evenly_spaced_levels(table.dark, table.bright, noise_sd / _PER_SD, most=MOST_LEVELS)
         turns_rad = plan.orientation_rad.reshape(-1, grid.n_places)
-        at_cards = self._rows_at_cards(plan.take(rows))
+        at_cards: IntArray = np.empty(0, dtype=np.int64)
+        if isinstance(self.model, TabulatedChain) and cards_of(self.model.chain):
+            part = plan.take(rows)
+            shares = self.model.footprint_share_by_card(self.model.chain.poses(np.empty((1, 0)), part), part)
+            at_cards = np.flatnonzero(sum(share[0] for share in shares) > _SHOWS)
         if at_cards.size:
             chosen, share = resampled_rows_and_weights(weight, MOST_PREDICTED)
             predicted = self.model.predict(theta[chosen], plan.take(rows[at_cards]))
@@ -421,13 +415,6 @@ class DiscForecast:
                 yield at, here
 
         return PredictiveDistributions(levels, level_weights)
-
-    def _rows_at_cards(self, plan: Plan) -> IntArray:
-        """Return the rows of a plan at which cards show."""
-        if not isinstance(self.model, TabulatedChain) or not cards_of(self.model.chain):
-            return np.empty(0, dtype=np.int64)
-        shares = self.model.footprint_share_by_card(self.model.chain.poses(np.empty((1, 0)), plan), plan)
-        return np.flatnonzero(sum(share[0] for share in shares) > _SHOWS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -476,9 +463,8 @@ class TabulatedChain:
         shares = []
         for card in cards_of(self.chain):
             out = np.zeros(np.broadcast_shapes(poses.x_mm.shape, poses.y_mm.shape))
-            within = (np.abs(poses.x_mm - card.x_mm) < card.width_mm / 2 + reach) & (
-                np.abs(poses.y_mm - card.y_mm) < card.height_mm / 2 + reach
-            )
+            beside = np.abs(poses.x_mm - card.x_mm) < card.width_mm / 2 + reach
+            within = beside & (np.abs(poses.y_mm - card.y_mm) < card.height_mm / 2 + reach)
             rows = np.flatnonzero(within.any(axis=0))
             if rows.size:
                 there, part = Poses(*(a[:, rows] for a in poses.arrays)), plan.take(rows)

@@ -120,12 +120,9 @@ def reachable_rows(reachable: BoolArray, n_places: int, n_combinations: int = 1)
     if reachable.shape != (n_places,):
         raise ShapeError(f"reachable has shape {reachable.shape}; allowed: ({n_places},), one per place")
     if not reachable.any():
-        raise ReachError(
-            "reachable places",
-            0,
-            f"at least one of the {reachable.size} places of the field; "
-            "is the field where the arm stands, and is its reach in millimetres?",
-        )
+        allowed = f"at least one of the {reachable.size} places of the field; "
+        allowed += "is the field where the arm stands, and is its reach in millimetres?"
+        raise ReachError("reachable places", 0, allowed)
     return np.flatnonzero(np.tile(reachable, n_combinations))
 
 

@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray, read_only_floats
-from probewise.errors import ParameterError, ShapeError, require
+from probewise.errors import ShapeError, require
 from probewise.recordings.plan import Plan
 
 _MOST_REPEATS = 1000
@@ -28,8 +28,7 @@ class Grid:
         for name in ("width_mm", "height_mm"):
             require(0 < getattr(self, name) < np.inf, name, getattr(self, name), "finite, greater than 0")
         for name in ("n_x", "n_y"):
-            if getattr(self, name) < 2:
-                raise ParameterError(name, getattr(self, name), "2 or more")
+            require(getattr(self, name) >= 2, name, getattr(self, name), "2 or more")
 
     @property
     def n_places(self) -> int:
@@ -104,10 +103,9 @@ class Designs:
     settings: tuple[tuple[str, tuple[float, ...]], ...] = ()
 
     def __post_init__(self) -> None:
-        if not self.orientations_rad or not np.isfinite(self.orientations_rad).all():
-            raise ParameterError("orientations_rad", self.orientations_rad, "one finite angle or more")
-        if not self.repeats or min(self.repeats) < 1 or max(self.repeats) > _MOST_REPEATS:
-            raise ParameterError("repeats", self.repeats, f"one number or more, each from 1 to {_MOST_REPEATS}")
+        turns, few = self.orientations_rad, f"one number or more, each from 1 to {_MOST_REPEATS}"
+        require(turns and np.isfinite(turns).all(), "orientations_rad", turns, "one finite angle or more")
+        require(self.repeats and all(1 <= n <= _MOST_REPEATS for n in self.repeats), "repeats", self.repeats, few)
         for name, values in self.settings:
             require(values and np.isfinite(values).all(), f"settings {name}", values, "one finite value or more")
 
@@ -153,9 +151,7 @@ class Designs:
             scan_names=tuple(str(k) for k in range(n_designs)),
             pattern=np.zeros(n_designs, dtype=np.int64),
             pattern_names=("",),
-            covariates={
-                name: np.repeat([dict(c.settings)[name] for c in combinations], n_places) for name, _ in self.settings
-            },
+            covariates={n: np.repeat([dict(c.settings)[n] for c in combinations], n_places) for n, _ in self.settings},
         )
 
     def cost_s(self, travel_s: FloatArray, read_s: float) -> FloatArray:

@@ -82,13 +82,10 @@ class ReadingNoise:
         if self.is_sd_inferred and not np.min(self.sd.from_unit(np.array([1e-9, 0.5]))) > 0:  # type: ignore[union-attr]
             raise ParameterError("noise sd", self.sd, "a prior of numbers greater than 0, such as LogUniform(0.1, 10)")
         require(checked_number("dof", self.dof) > 0, "dof", self.dof, "greater than 0; infinity is the Gaussian")
-        if not 0 <= checked_number("outliers", self.outliers) < 1:
-            raise ParameterError(
-                "outliers", self.outliers, "0 or more, below 1: the share of readings that are outliers"
-            )
-        if self.outliers and (self.between is None or not _is_range(self.between)):
-            allowed = "(low, high), finite, low < high: the least and the greatest outlier"
-            raise ParameterError("between", self.between, allowed)
+        share = "0 or more, below 1: the share of readings that are outliers"
+        require(0 <= checked_number("outliers", self.outliers) < 1, "outliers", self.outliers, share)
+        allowed = "(low, high), finite, low < high: the least and the greatest outlier"
+        require(not self.outliers or _is_range(self.between), "between", self.between, allowed)
 
     @classmethod
     def of(cls, given: AnyNoise) -> ReadingNoise:
@@ -117,18 +114,25 @@ class ReadingNoise:
         out = np.array(np.broadcast_to(sds, (predicted.size,))).reshape(predicted.shape)
         bad = ~((out > 0) & np.isfinite(out))
         if bad.any():
-            where = predicted[bad][0]
-            raise ParameterError(
-                f"noise sd of the predicted reading {where:g}", float(out[bad][0]), "finite, greater than 0"
-            )
+            name = f"noise sd of the predicted reading {predicted[bad][0]:g}"
+            raise ParameterError(name, float(out[bad][0]), "finite, greater than 0")
         return out
 
     def log_density(self, readings: FloatArray, predicted: FloatArray, scale: FloatArray) -> FloatArray:
         """Return the log density of readings, given predictions and sds (`scale`); arrays that broadcast."""
-        core = self._log_standard_density((readings - predicted) / scale) - np.log(scale)
+        z, nu = (readings - predicted) / scale, self.dof
+        if math.isinf(nu):
+            standard = -0.5 * (z * z + _LOG_2PI)
+        else:
+            constant = float(gammaln((nu + 1) / 2) - gammaln(nu / 2)) - 0.5 * math.log(nu * math.pi)
+            standard = constant - 0.5 * (nu + 1) * np.log1p(z * z / nu)
+        core = standard - np.log(scale)
         if not self.outliers:
             return np.asarray(core)
-        return np.asarray(np.logaddexp(math.log1p(-self.outliers) + core, self._log_outlier_density(readings)))
+        low, high = self._outlier_range
+        inside = (readings >= low) & (readings <= high)
+        outlying = np.where(inside, math.log(self.outliers / (high - low)), -np.inf)
+        return np.asarray(np.logaddexp(math.log1p(-self.outliers) + core, outlying))
 
     def cdf(self, readings: FloatArray, predicted: FloatArray, scale: FloatArray) -> FloatArray:
         """Return the probability of a smaller reading, given prediction and sd (`scale`); arrays that broadcast."""
@@ -157,26 +161,13 @@ class ReadingNoise:
         core = predicted + scale * z
         if not self.outliers:
             return np.asarray(core)
-        return np.where(
-            rng.random(predicted.shape) < self.outliers, rng.uniform(*self._outlier_range, predicted.shape), core
-        )
+        is_out = rng.random(predicted.shape) < self.outliers
+        return np.where(is_out, rng.uniform(*self._outlier_range, predicted.shape), core)
 
     @property
     def _outlier_range(self) -> tuple[float, float]:
         assert self.between is not None
         return self.between
-
-    def _log_standard_density(self, z: FloatArray) -> FloatArray:
-        if math.isinf(self.dof):
-            return np.asarray(-0.5 * (z * z + _LOG_2PI))
-        nu = self.dof
-        constant = float(gammaln((nu + 1) / 2) - gammaln(nu / 2)) - 0.5 * math.log(nu * math.pi)
-        return np.asarray(constant - 0.5 * (nu + 1) * np.log1p(z * z / nu))
-
-    def _log_outlier_density(self, readings: FloatArray) -> FloatArray:
-        low, high = self._outlier_range
-        inside = (readings >= low) & (readings <= high)
-        return np.where(inside, math.log(self.outliers / (high - low)), -np.inf)
 
 
 def _is_range(value: Any) -> bool:

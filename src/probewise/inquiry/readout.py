@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.errors import ParameterError, require
+from probewise.errors import require
 from probewise.priors import Prior
 
 MOST_LEVELS = 1000
@@ -80,12 +80,8 @@ class Readout:
 
     def require_in_range(self, value: float) -> None:
         """Raise ParameterError for a reading out of range; NaN, a missing reading, passes."""
-        if not (math.isnan(value) or self.low <= value <= self.high):
-            raise ParameterError(
-                "reading",
-                value,
-                f"{self.low:g} to {self.high:g}, the range of the sensor; is it the sensor that was calibrated?",
-            )
+        allowed = f"{self.low:g} to {self.high:g}, the range of the sensor; is it the sensor that was calibrated?"
+        require(math.isnan(value) or self.low <= value <= self.high, "reading", value, allowed)
 
     def cell_edges(self, levels: FloatArray, *, fine: float = _FINE, most: int | None = None) -> FloatArray:
         """Return the edges of the cells for readings of these levels, (n_cells - 1,); the end cells are open.

@@ -21,7 +21,7 @@ from typing import Any, Protocol, Self
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray, frozen_int, logsumexp
-from probewise.errors import ParameterError
+from probewise.errors import require
 from probewise.nested import (
     LIVE_PER_PARAM,
     KernelMove,
@@ -175,12 +175,8 @@ class Particles:
 def prior_particles(prior: Prior, n_particles: int, *, rng: np.random.Generator) -> Particles:
     """Draw equally weighted samples of the prior, with evidence 1; ParameterError for a prior without mass."""
     theta = prior.from_unit_cube(rng.random((n_particles, len(prior.names))))
-    if not np.isfinite(prior.log_prob(theta)).all():
-        raise ParameterError(
-            "prior",
-            prior.names,
-            "one with mass: its draws must have a density above zero. Do its bounds leave room for anything?",
-        )
+    allowed = "one with mass: its draws must have a density above zero. Do its bounds leave room for anything?"
+    require(np.isfinite(prior.log_prob(theta)).all(), "prior", prior.names, allowed)
     drawn = evenly_weighted(prior.names, theta, np.zeros(n_particles))
     return Particles(drawn, np.arange(n_particles))
 
@@ -235,7 +231,10 @@ def update(
         if power == 1.0 and n_eff >= least:
             break
         rows = resampled_rows(np.exp(log_weight - log_weight.max()), n, rng)
-        parts = _partition_rows(rows) if fall_back is None else [np.arange(n)]
+        parts = [np.arange(n)]
+        if fall_back is None:  # copies of a sample in the same part, unless one of two is too small to fit kernels
+            halves = [np.flatnonzero(rows % 2 == k) for k in (0, 1)]
+            parts = halves if min(map(len, halves)) >= _LEAST_PART * n else parts
         now, accepted, n_moves = _move_by_metropolis(now.take_rows(rows), power, problem, rng, parts, effort)
         n_calls, n_temperatures = n_calls + n_moves, n_temperatures + 1
         ancestor, stuck = ancestor[rows], accepted < _STIFF
@@ -402,13 +401,8 @@ def _move_by_metropolis(
             for k, rows in enumerate(parts):
                 theta[rows], log_ratio[rows] = propose(now.theta[rows], kernels[k - 1], rng)
             proposed = _EvaluatedSamples.of(theta, problem, power)
-            odds = (
-                proposed.log_prior
-                + proposed.log_likelihood_at_power(power)
-                - now.log_prior
-                - now.log_likelihood_at_power(power)
-                + log_ratio
-            )
+            odds = proposed.log_prior + proposed.log_likelihood_at_power(power)
+            odds = odds - now.log_prior - now.log_likelihood_at_power(power) + log_ratio
             taken = np.log(rng.random(n)) < odds
             now = now.with_rows_overwritten(taken, proposed)
             n_calls += n
@@ -434,15 +428,6 @@ def _propose_along_differences(
     one, other = rng.integers(n, size=(2, n))
     length = 2.38 / math.sqrt(2 * n_params) * 10.0 ** rng.uniform(-2.0, 0.0, (n, 1))
     return theta + length * (theta[one] - theta[other]), np.zeros(n)
-
-
-def _partition_rows(rows: IntArray) -> list[IntArray]:
-    """Split the samples resampled by `rows` into two parts, with copies of a sample in the same part.
-
-    Return the indices of each part's samples; a single part if one of the two would be too small to fit kernels.
-    """
-    parts = [np.flatnonzero(rows % 2 == k) for k in (0, 1)]
-    return parts if min(map(len, parts)) >= _LEAST_PART * len(rows) else [np.arange(len(rows))]
 
 
 def _next_power(log_weight: FloatArray, base: FloatArray, now: _EvaluatedSamples, power: float, enough: float) -> float:

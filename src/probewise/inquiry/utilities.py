@@ -321,8 +321,7 @@ class ParameterValue:
     n_bins: int = 16
 
     def __post_init__(self) -> None:
-        if self.n_bins < 2:
-            raise ParameterError("n_bins", self.n_bins, "2 or more")
+        require(self.n_bins >= 2, "n_bins", self.n_bins, "2 or more")
 
     def __str__(self) -> str:
         return self.name

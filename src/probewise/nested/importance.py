@@ -19,7 +19,7 @@ from scipy.special import expit
 
 from probewise._arrays import FloatArray, logsumexp, own_arithmetic
 from probewise._kinds import checked_whole, require_callable, require_rng
-from probewise.errors import ParameterError, require
+from probewise.errors import require
 from probewise.nested.clusters import Clusters, find_disconnected_clusters
 from probewise.nested.problem import Evaluator, Samplable, Space, unbounded_space_of
 from probewise.nested.result import NestedResult, Samples
@@ -566,8 +566,8 @@ def repartitioned(problem: Samplable, theta: FloatArray, *, peaks: Sequence[Floa
     determine the axes.
     """
     n_different, least = len(np.unique(theta, axis=0)), _LEAST_SAMPLES * len(problem.prior.names)
-    if n_different < max(least, 1):
-        raise ParameterError("theta", f"{n_different} different samples", f"{least} or more; run with more live points")
+    found, allowed = f"{n_different} different samples", f"{least} or more; run with more live points"
+    require(n_different >= max(least, 1), "theta", found, allowed)
     return Repartitioned(problem, _PriorNearPosterior(problem.prior, (theta, *peaks)))
 
 

@@ -408,11 +408,9 @@ def as_problem(
     """Return a problem as it is, or make one of a log likelihood and its prior by `make_problem`."""
     if hasattr(problem, "log_likelihood") or isinstance(problem, type):
         if prior is not None or names is not None or vectorized or pass_dict or periodic:
-            raise ParameterError(
-                "prior, names, vectorized, pass_dict, periodic",
-                "given beside a problem that has its own",
-                "these beside a log likelihood, a function; or nested.run(problem, rng=rng)",
-            )
+            found = "given beside a problem that has its own"
+            allowed = "these beside a log likelihood, a function; or nested.run(problem, rng=rng)"
+            raise ParameterError("prior, names, vectorized, pass_dict, periodic", found, allowed)
         return cast(Samplable, problem)
     if prior is None:
         allowed = "a problem with a prior and a log_likelihood(theta), such as inference.SensorProblem; or a function"
@@ -495,8 +493,8 @@ def _as_marginal(name: str, one: Any) -> Marginal:
         return parse_prior(name, one)
     has_quantile = hasattr(one, "ppf") or hasattr(one, "icdf")
     if has_quantile and hasattr(one, "cdf") and hasattr(one, "logpdf") and not isinstance(one, type):
-        if hasattr(one, "freeze"):
-            raise ParameterError(name, one, "a frozen distribution, with its parameters: scipy.stats.norm(0, 1)")
+        frozen = "a frozen distribution, with its parameters: scipy.stats.norm(0, 1)"
+        require(not hasattr(one, "freeze"), name, one, frozen)
         return _ScipyMarginal(one)
     raise ParameterError(
         name,

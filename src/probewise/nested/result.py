@@ -134,8 +134,8 @@ class Samples(ShowsItself):
         """
         share = "greater than 0, less than 1"
         columns = ", ".join(f"{name} {k}" for k, name in enumerate(self.names))
-        if not 0 < checked_number("mass", mass, f"a number {share}; columns of the result are {columns}") < 1:
-            raise ParameterError("mass", mass, share)
+        number = checked_number("mass", mass, f"a number {share}; columns of the result are {columns}")
+        require(0 < number < 1, "mass", mass, share)
         return self.quantiles([0.5 - mass / 2, 0.5 + mass / 2])
 
 
@@ -448,8 +448,7 @@ def n_alive_at_death(
 
 
 def _seed_states_of_mergeable_runs(parts: Sequence[NestedResult]) -> list[object]:
-    if len(parts) < 2:
-        raise ParameterError("results", f"{len(parts)} runs", "two runs or more")
+    require(len(parts) >= 2, "results", f"{len(parts)} runs", "two runs or more")
     names, seeds = parts[0].names, list[object]()
     require(names, "results", "runs without parameters", "runs with some; the evidence is exact without")
     for number, result in enumerate(parts, start=1):

@@ -31,7 +31,7 @@ from probewise._kinds import (
     require_like,
     require_rng,
 )
-from probewise.errors import DoubtfulResultWarning, NotConvergedError, ParameterError, require, warn
+from probewise.errors import DoubtfulResultWarning, NotConvergedError, require, warn
 from probewise.nested.check import check_and_repeat
 from probewise.nested.evidence import (
     DOUBTFUL_P_VALUE,
@@ -305,8 +305,8 @@ def run_once(
     require(n_live <= most, "n_live", n_live, allowed)
     n_replaced = n_live // 2 if n_replaced is None else checked_whole("n_replaced", n_replaced, least=None)
     require(1 <= n_replaced <= n_live // 2, "n_replaced", n_replaced, f"1 to n_live / 2 = {n_live // 2}")
-    if max_calls is not None and checked_whole("max_calls", max_calls, least=None, most=None) < n_live:
-        raise ParameterError("max_calls", max_calls, f"n_live = {n_live} or more")
+    enough = max_calls is None or checked_whole("max_calls", max_calls, least=None, most=None) >= n_live
+    require(enough, "max_calls", max_calls, f"n_live = {n_live} or more")
     seed_state = json.dumps(rng.bit_generator.state, default=as_json)
     if n_params == 0:
         only = np.empty((1, 0))

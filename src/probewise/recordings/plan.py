@@ -386,8 +386,8 @@ class Recording(ShowsItself):
         require(not missing, "columns", tuple(columns), f"{', '.join(missing)} among them; rename the table's columns")
         turn_deg, turn_rad = columns.get("orientation_deg"), columns.get("orientation_rad", 0.0)
         if turn_deg is not None:
-            if "orientation_rad" in columns:
-                raise ParameterError("columns", tuple(columns), "one of orientation_deg and orientation_rad")
+            one = "one of orientation_deg and orientation_rad"
+            require("orientation_rad" not in columns, "columns", tuple(columns), one)
             turn_rad = np.radians(numbers_per_reading("orientation_deg", turn_deg))
         covariates, notes = numeric_covariates_and_notes(columns, controls)
         readings = numbers_per_reading("reading", texts_to_numbers(columns["reading"]))
@@ -486,8 +486,7 @@ def require_recording(recording: object) -> None:
 def require_patterns_described(plan: Plan) -> None:
     """Raise ParameterError where a pattern that occurs in the plan is not described."""
     for name, _ in plan.rows_by_pattern():
-        if name not in plan.patterns:
-            raise ParameterError("pattern", name, how_to_describe_pattern(name, list(plan.patterns)))
+        require(name in plan.patterns, "pattern", name, how_to_describe_pattern(name, list(plan.patterns)))
 
 
 def range_in_words(low: float | None, high: float | None) -> str:

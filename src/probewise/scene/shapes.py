@@ -122,12 +122,9 @@ def _require_bounds_fit_field(shape: Circle | Ellipse | Rectangle | RegularPolyg
     require_kind("field", field, Field, "a Field: Field(width_mm, height_mm)")
     low, high = checked_pair(name, bounds, "(low, high): its prior is even between them")
     require(0 < low < high < math.inf, name, bounds, "0 < low < high, finite")
-    if shape.inside and 2 * reach * high >= min(field.width_mm, field.height_mm):
-        raise ParameterError(
-            f"{type(shape).__name__}(inside=True)",
-            f"up to {2 * reach * high:g} mm wide",
-            f"less than the field's {field.width_mm:g} x {field.height_mm:g} mm (or inside=False)",
-        )
+    fits = not shape.inside or 2 * reach * high < min(field.width_mm, field.height_mm)
+    name, found = f"{type(shape).__name__}(inside=True)", f"up to {2 * reach * high:g} mm wide"
+    require(fits, name, found, f"less than the field's {field.width_mm:g} x {field.height_mm:g} mm (or inside=False)")
 
 
 def _half_extent_of_circle(own: FloatArray) -> FloatArray:

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import ndtr, ndtri, owens_t
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.errors import ParameterError, SlowWarning, warn
+from probewise.errors import SlowWarning, require, warn
 from probewise.scene.regions import (
     EllipseRegion,
     HalfPlaneRegion,
@@ -342,8 +342,7 @@ def _mass_beyond_edges(height: FloatArray, start: FloatArray, end: FloatArray) -
 @cache
 def _half_legendre_rule(n_nodes: int) -> tuple[FloatArray, FloatArray]:
     """Return the positive half of the Gauss-Legendre rule on (-1, 1): nodes and weights."""
-    if n_nodes < 2 or n_nodes % 2:
-        raise ParameterError("n_nodes", n_nodes, "an even number, 2 or more")
+    require(n_nodes >= 2 and n_nodes % 2 == 0, "n_nodes", n_nodes, "an even number, 2 or more")
     node, weight = np.polynomial.legendre.leggauss(n_nodes)
     return node[n_nodes // 2 :], weight[n_nodes // 2 :]
 

@@ -12,7 +12,7 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray, logsumexp, read_only_floats, require_finite
 from probewise._display import ShowsItself
 from probewise._kinds import checked_whole
-from probewise.errors import ParameterError, ShapeError, require
+from probewise.errors import ShapeError, require
 from probewise.scene.regions import Region
 from probewise.sensor.stages import Footprint, Poses
 
@@ -43,14 +43,11 @@ def footprint_of(theta: FloatArray, n_gaussians: int) -> Footprint:
     rows = np.ascontiguousarray(theta.reshape(len(theta), n_gaussians, 6).transpose(2, 1, 0))
     a, u, v, aa, bb, cc = rows
     determinant = aa * bb - cc * cc
-    if not ((determinant > 0) & (aa > 0)).all():
-        raise ParameterError(
-            "A B - C^2 of a Gaussian", float(determinant.min()), "greater than 0, with A > 0 and B > 0"
-        )
+    positive, least = ((determinant > 0) & (aa > 0)).all(), float(determinant.min(initial=np.inf))
+    require(positive, "A B - C^2 of a Gaussian", least, "greater than 0, with A > 0 and B > 0")
     mass = a / np.sqrt(determinant)
     total = mass.sum(axis=0)
-    if not (total > 0).all():
-        raise ParameterError("mass of the SSF", float(total.min()), "greater than 0")
+    require((total > 0).all(), "mass of the SSF", float(total.min(initial=np.inf)), "greater than 0")
     half = 0.5 / determinant
     return Footprint(*(part.T[:, None] for part in (mass / total, u, v, half * bb, half * aa, -half * cc)))
 

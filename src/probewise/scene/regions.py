@@ -59,10 +59,8 @@ def broadcast_and_freeze_fields(region: object, **shapes: tuple[int, ...]) -> No
     for name, shape in shapes.items():
         array = np.asarray(getattr(region, name), dtype=np.float64)
         array = arrays[name] = array[None] if array.ndim == len(shape) else array
-        fits = array.ndim == len(shape) + 1 and all(
-            want in (-1, got) for want, got in zip(shape, array.shape[1:], strict=True)
-        )
-        if not fits:
+        wants = zip(shape, array.shape[1:], strict=False)
+        if array.ndim != len(shape) + 1 or any(want not in (-1, got) for want, got in wants):
             raise ShapeError(f"{name} has shape {array.shape}; allowed: (n_regions, {', '.join(map(str, shape))})")
         require_finite(name, array)
     n_regions = max(map(len, arrays.values()))
@@ -432,12 +430,9 @@ class RegionsOfMixedKinds(RegionBatch):
         return [(rows, part) for rows, part in pairs if rows.size]
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
-        return self._joined(len(points_mm), lambda part: part.albedo(points_mm))
-
-    def _joined(self, n_points: int, of: Callable[[Region], FloatArray]) -> FloatArray:
-        out = np.empty((self.n_regions, n_points))
+        out = np.empty((self.n_regions, len(points_mm)))
         for rows, part in self.rows_and_regions():
-            out[rows] = of(part)
+            out[rows] = part.albedo(points_mm)
         return out
 
 

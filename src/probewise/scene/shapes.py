@@ -151,11 +151,8 @@ class Circle:
     @cached_property
     def prior(self) -> PlacedPrior:
         """Uniform over radius and centre; with `inside`, over the centres that keep the circle on the field."""
-        return PlacedPrior(
-            self.field,
-            Product({"radius_mm": Uniform(*self.radius_mm)}),
-            _half_extent_of_circle if self.inside else None,
-        )
+        own = Product({"radius_mm": Uniform(*self.radius_mm)})
+        return PlacedPrior(self.field, own, _half_extent_of_circle if self.inside else None)
 
     def region(self, theta: FloatArray) -> EllipseRegion:
         """Build the discs of the hypotheses, one per row of theta (n_samples, 3)."""
@@ -219,9 +216,8 @@ class Ellipse:
 
         With `inside`, the centre is uniform over the places that keep the ellipse on the field.
         """
-        return PlacedPrior(
-            self.field, _EllipseOwnPrior(self.semi_axes_mm), _half_extent_of_ellipse if self.inside else None
-        )
+        own = _EllipseOwnPrior(self.semi_axes_mm)
+        return PlacedPrior(self.field, own, _half_extent_of_ellipse if self.inside else None)
 
     def region(self, theta: FloatArray) -> EllipseRegion:
         """Build the ellipses of the hypotheses, one per row of theta (n_samples, 5)."""

@@ -46,18 +46,10 @@ _CELLS = 2**13
 PER_SD = _CELLS / (2 * _LIMIT)  # cells of the table per standard deviation
 CENTRE = _CELLS / 2  # position of z = 0, in cells
 _CACHED = 2**14  # elements that fit the cache together with the table
-
-
-def _tabulate_normal_cdf() -> tuple[FloatArray, FloatArray]:
-    """Return the standard normal's cumulative at the table's nodes, and its derivative per cell, 0 at both ends."""
-    z = (np.arange(_CELLS + 1) - CENTRE) / PER_SD
-    value, slope = ndtr(z), np.exp(-0.5 * z * z) / (math.sqrt(2 * math.pi) * PER_SD)
-    value[0], value[-1] = 0.0, 1.0
-    slope[0] = slope[-1] = 0.0
-    return value, slope
-
-
-_VALUE, _SLOPE = _tabulate_normal_cdf()
+_NODES = (np.arange(_CELLS + 1) - CENTRE) / PER_SD
+_VALUE, _SLOPE = ndtr(_NODES), np.exp(-0.5 * _NODES * _NODES) / (math.sqrt(2 * math.pi) * PER_SD)  # per cell
+_VALUE[0], _VALUE[-1] = 0.0, 1.0
+_SLOPE[0] = _SLOPE[-1] = 0.0
 
 
 def normal_cdf_of_cells_in_place(cells: FloatArray) -> None:
@@ -115,10 +107,6 @@ class LabGaussian:
     var_x: FloatArray
     var_y: FloatArray
     cov_xy: FloatArray
-
-    def select_samples(self, rows: IntArray) -> LabGaussian:
-        """Return the Gaussian of the samples `rows`; arrays shared by all samples are kept as they are."""
-        return LabGaussian(**{name: a[rows] if len(a) != 1 else a for name, a in vars(self).items()})
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -197,9 +185,8 @@ def _mean_albedo_over_half_plane(region: HalfPlaneRegion, gaussian: LabGaussian,
 def _mean_albedo_over_ramp(region: RampRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Return the mean albedo over a ramp: the albedo at the Gaussian's mean, exact for a linear field."""
     cosine, sine = np.cos(region.normal_rad)[:, None], np.sin(region.normal_rad)[:, None]
-    return region.per_mm[:, None] * (
-        cosine * (gaussian.x_mm + gaussian.dx_mm) + sine * (gaussian.y_mm + gaussian.dy_mm)
-    )
+    along = cosine * (gaussian.x_mm + gaussian.dx_mm) + sine * (gaussian.y_mm + gaussian.dy_mm)
+    return region.per_mm[:, None] * along
 
 
 @mean_albedo_under_one_gaussian.register
@@ -207,9 +194,8 @@ def _mean_albedo_over_stripes(region: StripesRegion, gaussian: LabGaussian, n_no
     """Return the mean albedo over stripes: a sum of cumulatives or, over fine stripes, of a Fourier series."""
     cosine, sine = np.cos(region.normal_rad)[:, None], np.sin(region.normal_rad)[:, None]
     period, duty = region.period_mm[:, None], region.duty[:, None]
-    along = (
-        cosine * (gaussian.x_mm + gaussian.dx_mm) + sine * (gaussian.y_mm + gaussian.dy_mm) - region.phase_mm[:, None]
-    )
+    along = cosine * (gaussian.x_mm + gaussian.dx_mm) + sine * (gaussian.y_mm + gaussian.dy_mm)
+    along = along - region.phase_mm[:, None]
     sd = np.sqrt(cosine**2 * gaussian.var_x + sine**2 * gaussian.var_y + 2 * cosine * sine * gaussian.cov_xy)
     along, sd, period, duty = np.broadcast_arrays(along / period, sd / period, period, duty)  # in periods
     share = np.empty(along.shape)
@@ -317,9 +303,8 @@ def _mean_albedo_over_polygon(region: PolygonRegion, gaussian: LabGaussian, n_no
 def _mean_albedo_over_region_with_cards(region: CardedRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Return the mean albedo over a region with cards laid on it, from those over the region and each card."""
     covered = [mean_albedo_under_one_gaussian(card.region, gaussian, n_nodes) for card in region.cards]
-    return mean_albedo_with_cards(
-        mean_albedo_under_one_gaussian(region.region, gaussian, n_nodes), region.cards, covered
-    )
+    below = mean_albedo_under_one_gaussian(region.region, gaussian, n_nodes)
+    return mean_albedo_with_cards(below, region.cards, covered)
 
 
 def _mass_beyond_edges(height: FloatArray, start: FloatArray, end: FloatArray) -> FloatArray:
@@ -362,10 +347,8 @@ def _mean_albedo_over_ellipse(region: EllipseRegion, gaussian: LabGaussian, n_no
     var_p = (cosine**2 * gaussian.var_x + sine**2 * gaussian.var_y + cross) / a**2
     var_q = (sine**2 * gaussian.var_x + cosine**2 * gaussian.var_y - cross) / b**2
     twist = cosine * sine * (gaussian.var_y - gaussian.var_x) + (cosine**2 - sine**2) * gaussian.cov_xy
-    cov_pq = twist / (a * b)
-    return _albedo_by_share_inside(
-        region.outside, region.inside, _mass_in_unit_disc(p, q, var_p, var_q, cov_pq, n_nodes)
-    )
+    share = _mass_in_unit_disc(p, q, var_p, var_q, twist / (a * b), n_nodes)
+    return _albedo_by_share_inside(region.outside, region.inside, share)
 
 
 def _mass_in_unit_disc(
@@ -375,17 +358,15 @@ def _mass_in_unit_disc(
 
     Only the (sample, reading) pairs whose edge is within reach are integrated.
     """
-    reach = _sds_covered_by_nodes(n_nodes)
+    reach = float(np.clip(4.3 + (n_nodes - 20) / 20, 4.0, 6.5))  # sds: truncation and quadrature errors balance
     largest = np.sqrt(0.5 * (var_p + var_q) + np.hypot(0.5 * (var_p - var_q), cov_pq))
     distance = np.sqrt(p * p + q * q)
     near = np.abs(distance - 1) < reach * largest
-    share = (distance < 1).astype(np.float64)
-    share = np.array(np.broadcast_to(share, near.shape))
+    share = np.array(np.broadcast_to((distance < 1).astype(np.float64), near.shape))
     if not near.any():
         return share
-    p, q, d, var_p, var_q, cov_pq = (
-        np.broadcast_to(a, near.shape)[near] for a in (p, q, distance, var_p, var_q, cov_pq)
-    )
+    every = (p, q, distance, var_p, var_q, cov_pq)
+    p, q, d, var_p, var_q, cov_pq = (np.broadcast_to(a, near.shape)[near] for a in every)
     at_centre = d == 0
     safe = np.where(at_centre, 1.0, d)
     c = np.where(at_centre, 1.0, p / safe)
@@ -399,11 +380,6 @@ def _mass_in_unit_disc(
 
 _BLOCK = 2**13  # nodes at a time: they fit the cache
 _FLAT, _BENT = 0.01, 0.4  # curvature of an edge, in footprints of sd 1, up to which few and some nodes suffice
-
-
-def _sds_covered_by_nodes(n_nodes: int) -> float:
-    """Choose how many standard deviations n_nodes cover, so that truncation and quadrature errors balance."""
-    return float(np.clip(4.3 + (n_nodes - 20) / 20, 4.0, 6.5))
 
 
 def _mass_in_disc_by_chords(
@@ -475,9 +451,8 @@ def _mass_in_disc_by_skewed_chords(
     found = weight @ _normal_cdf_overwriting((along - mean_x) * per_sd - across)
     back = np.flatnonzero(node[-1] * np.abs(tilt) - mean_x * per_sd > -_REACH)
     if back.size:
-        found[back] -= weight @ _normal_cdf_overwriting(
-            (-along[:, back] - mean_x[back]) * per_sd[back] - across[:, back]
-        )
+        behind = (-along[:, back] - mean_x[back]) * per_sd[back] - across[:, back]
+        found[back] -= weight @ _normal_cdf_overwriting(behind)
     return np.asarray(found)
 
 
@@ -513,9 +488,8 @@ def _mass_in_disc_by_long_chords(
     y -= mean_y
     y /= short
     inner *= np.exp(-0.5 * y * y) * x * widen
-    return np.asarray(
-        np.concatenate([weight[::-1], weight]) @ inner * ((high - low) * 2 / (np.sqrt(2 * np.pi) * short))
-    )
+    mass = np.concatenate([weight[::-1], weight]) @ inner
+    return np.asarray(mass * ((high - low) * 2 / (np.sqrt(2 * np.pi) * short)))
 
 
 def _tangent_of_quarter_arcsine(y: FloatArray) -> FloatArray:
@@ -535,7 +509,8 @@ def _mean_albedo_over_mixed_regions(region: RegionsOfMixedKinds, gaussian: LabGa
     """Return the mean albedo, (n_samples, n_points), of regions of several kinds: each by the rule for its kind."""
     out = np.empty(np.broadcast_shapes(gaussian.shape, (region.n_regions, 1)))
     for rows, part in region.rows_and_regions():
-        out[rows] = mean_albedo_under_one_gaussian(part, gaussian.select_samples(rows), n_nodes)
+        own = LabGaussian(*(a[rows] if len(a) != 1 else a for a in vars(gaussian).values()))
+        out[rows] = mean_albedo_under_one_gaussian(part, own, n_nodes)
     return out
 
 

@@ -370,30 +370,16 @@ def _mass_mean_covariance(w: FloatArray, means: FloatArray, covs: FloatArray) ->
 # one Gaussian and no parameter is redundant.
 
 
-def _places_and_widths_on_rings(*rings: tuple[float, int, float, float]) -> tuple[FloatArray, FloatArray]:
-    """Return Gaussians' places (n, 2) and widths (n,); a ring is (radius, number, width, rotation in spacings)."""
-    places = [
-        (radius * np.cos(turn), radius * np.sin(turn))
-        for radius, n, _, first in rings
-        for turn in 2 * np.pi * (np.arange(n) + first) / n
-    ]
-    return np.array(places), np.repeat([width for _, _, width, _ in rings], [n for _, n, _, _ in rings])
-
-
-# In sds of the one Gaussian: spaced by about their widths, out to where a long tail still shows.
-_PLACES, _WIDTHS = _places_and_widths_on_rings(
-    (0.0, 1, 0.45, 0.0), (0.8, 6, 0.5, 0.0), (1.6, 8, 0.6, 0.0), (2.7, 4, 0.9, 0.5)
-)
-
-
-def _moment_preserving_basis() -> FloatArray:
-    """Return an orthonormal basis of the shares that change neither mean nor covariance, (N_FREE_FORM - 1, N_BENDS)."""
-    x, y = _PLACES.T
-    moments = np.stack([x, y, x * x + _WIDTHS**2 - 1, y * y + _WIDTHS**2 - 1, x * y])
-    return np.ascontiguousarray(np.linalg.svd(moments)[2][len(moments) :].T)
-
-
-_DIRECTIONS = _moment_preserving_basis()
+# Rings (radius, number, width, rotation in spacings), in sds of the one Gaussian: spaced by about their widths, out to
+# where a long tail still shows.
+_RINGS = ((0.0, 1, 0.45, 0.0), (0.8, 6, 0.5, 0.0), (1.6, 8, 0.6, 0.0), (2.7, 4, 0.9, 0.5))
+_TURNS = [(radius, turn) for radius, n, _, first in _RINGS for turn in 2 * np.pi * (np.arange(n) + first) / n]
+_PLACES = np.array([(radius * np.cos(turn), radius * np.sin(turn)) for radius, turn in _TURNS])
+_WIDTHS = np.repeat([width for _, _, width, _ in _RINGS], [n for _, n, _, _ in _RINGS])
+_X, _Y = _PLACES.T
+_MOMENTS = np.stack([_X, _Y, _X * _X + _WIDTHS**2 - 1, _Y * _Y + _WIDTHS**2 - 1, _X * _Y])
+_DIRECTIONS: FloatArray = np.ascontiguousarray(np.linalg.svd(_MOMENTS)[2][len(_MOMENTS) :].T)
+"""Orthonormal basis of the shares that change neither mean nor covariance, (N_FREE_FORM - 1, N_BENDS)."""
 
 N_BENDS: int = _DIRECTIONS.shape[1]
 """Number of free-form coefficients (bends)."""

@@ -9,14 +9,13 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache
-from numbers import Real
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from scipy.special import erfc, gammainc, gammaincc, gammainccinv, gammaincinv, ndtr, ndtri
 
 from probewise._arrays import FloatArray, floats, logsumexp
-from probewise._kinds import checked_number, require_kind, require_like
+from probewise._kinds import checked_number, checked_pair, require_kind, require_like
 from probewise.errors import ParameterError, ShapeError, require
 
 __all__ = ["Joint", "LogNormal", "LogUniform", "Marginal", "Normal", "Prior", "Product", "Uniform", "require_prior"]
@@ -190,16 +189,10 @@ def parse_prior(what: str, given: Any) -> Marginal:
     require(isinstance(given, Sequence) and not isinstance(given, str) and given, what, given, allowed)
     kinds: dict[object, Callable[[float, float], Marginal]] = {"log": LogUniform, "normal": Normal, "uniform": Uniform}
     kind, numbers = (given[0], given[1:]) if isinstance(given[0], str) else ("uniform", given)
-    require(
-        kind in kinds
-        and len(numbers) == 2
-        and all(isinstance(number, Real) and not isinstance(number, bool) for number in numbers),
-        what,
-        given,
-        allowed,
-    )
+    require(kind in kinds and bool not in map(type, numbers), what, given, allowed)
+    low, high = checked_pair(what, numbers, allowed)
     try:
-        return kinds[kind](float(numbers[0]), float(numbers[1]))
+        return kinds[kind](low, high)
     except ParameterError as error:
         raise ParameterError(what, given, f"{error.allowed}: a prior with mass") from error
 

@@ -164,6 +164,29 @@ def test_settings_come_back_in_the_form_they_were_given(name):
     assert asked.posterior.mean()[0] == pytest.approx(0.5, abs=0.05)
 
 
+def test_what_a_person_or_the_model_does_to_an_array_changes_no_setting_reading_or_prediction():
+    """The arrays handed out are converted in place, and the model fills the same array at each call."""
+    frame = pytest.importorskip("pandas").DataFrame
+    filled = np.empty(len(PLACES))
+
+    def in_place(p, x):
+        out = np.broadcast_shapes(np.shape(p["slope"]), np.shape(x[0]))
+        here = filled if out == filled.shape else np.empty(out)
+        np.multiply(p["slope"], x[0], out=here)
+        return here
+
+    table = frame({"x": PLACES})
+    for settings, model in ((PLACES[:, None], in_place), (table, lambda p, x: in_place(p, [x["x"]]))):
+        asked = inquiry(model=model, prior={"slope": Normal(0.0, 1.0)}, settings=settings)
+        chosen = asked.next()
+        chosen[0 if settings is not table else "x"] *= 1000
+        asked.tell(1.0)
+        assert np.max([*asked.readings[0][0].values()] if settings is table else asked.readings[0][0]) <= 2.0
+        assert asked.posterior.mean()[0] == pytest.approx(0.49, abs=0.02)
+    with pytest.raises(ParameterError, match="columns is 'a'; allowed: each name once"):
+        inquiry(settings=frame([[1, 2]], columns=["a", "a"]))
+
+
 def plain_root(p, x):
     """Takes numbers, not arrays: of one sample, at one setting."""
     return p["offset"] + math.sqrt(x) if x > 0.5 else p["offset"] + p["slope"] * x
@@ -228,6 +251,7 @@ def test_the_summary_names_readings_evidence_and_goal():
         ({"noise": -1.0}, "noise sd is -1.0; allowed: a number greater than 0"),
         ({"goal": {"slop": 0.1}}, "goal is 'slop'; allowed: parameters among slope, offset; did you mean slope"),
         ({"goal": {"slope": 0.0}}, r"goal\['slope'\] is 0.0; allowed: greater than 0"),
+        ({"prior": {"slope": (0, 10**400), "offset": Normal(0, 1)}}, r"'slope'\].*allowed: \(low, high\)"),
         ({"goal": 0.1}, "goal is 0.1; allowed: posterior sds by parameter"),
         ({"cost_s": [1, 1, 1, 1, 0.0]}, "allowed: seconds greater than 0"),
         ({"n_samples": 10}, "n_samples is 10; allowed: a whole number, 400 or more"),

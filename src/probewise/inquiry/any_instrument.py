@@ -33,6 +33,7 @@ from probewise.nested import Weighted, make_problem
 from probewise.nested.problem import AnyPrior
 from probewise.nested.weights import resampled_rows
 from probewise.priors import Joint, Prior, Product, require_prior
+from probewise.recordings.columns import columns_by_name
 
 Column: TypeAlias = NDArray[Any]
 
@@ -40,8 +41,8 @@ NOISE_SD = "noise.sd"
 """Name of the parameter that an unknown sd of the noise is."""
 
 _ALLOWED = (
-    "one knob: numbers or names (n,); several: numbers (n, n_knobs), a row for each setting; or a dict of columns (n,) "
-    "by name, all of one length"
+    "one knob: numbers or names (n,); several: numbers (n, n_knobs), a row for each setting; or columns (n,) by "
+    "name, all of one length: a dict or a data frame"
 )
 _BLOCK = 2_000_000  # densities held, or readings predicted, at a time
 _LOST_NATS = 3.0  # prior samples overrate the evidence by as much in 5 % of cases at most (Markov's inequality)
@@ -74,6 +75,8 @@ class Settings:
         """Read settings in any of their forms; ParameterError for anything else."""
         if isinstance(given, Settings):
             return given
+        if hasattr(given, "columns"):  # a data frame
+            given = columns_by_name(given)
         if isinstance(given, Mapping):
             columns = {str(name): _checked_column(f"settings[{name!r}]", values) for name, values in given.items()}
             if not columns or len({len(column) for column in columns.values()}) != 1:
@@ -256,7 +259,7 @@ def _called(function: Callable[..., Any], parameters: Any, settings: Any, shape:
         out = floats(function(parameters, settings), "what the model returns")
     if out.ndim != len(shape) or any(have not in (1, want) for have, want in zip(out.shape, shape, strict=True)):
         raise ShapeError(f"model returns an array of shape {out.shape}; allowed: {shape}, one number for each setting")
-    return out if out.shape == shape else np.array(np.broadcast_to(out, shape))
+    return np.array(np.broadcast_to(out, shape))  # a function may fill the same array at each call
 
 
 def _repeatable(one: Callable[[bytes, Settings], FloatArray], theta: FloatArray, at: Settings) -> FloatArray:
@@ -402,10 +405,10 @@ class Inquiry(ShowsItself):
         self._particles = prior_particles(self._model.prior, self._n_samples, rng=rng)
         self._prior_theta = self.posterior.theta
         self._prior_log_likelihood, self._lost_nats = np.zeros(self._n_samples), 0.0
-        self._taken: list[tuple[Any, float]] = []
+        self._taken: list[tuple[Settings, float]] = []
         self._readings: ReadingsProblem | None = None
         self._utility: FloatArray | None = None
-        self._next: Any = None
+        self._next: int | None = None
         self._costs_s(None)
 
     @property
@@ -421,7 +424,7 @@ class Inquiry(ShowsItself):
     @property
     def readings(self) -> tuple[tuple[Any, float], ...]:
         """Pairs (setting, reading) so far; to resume, call `tell(reading, setting)` of a new inquiry for each."""
-        return tuple(self._taken)
+        return tuple((at[0], value) for at, value in self._taken)
 
     @property
     @own_arithmetic
@@ -468,7 +471,7 @@ class Inquiry(ShowsItself):
         p_value, worst = self._readings.p_value_and_worst_reading(best)
         if p_value >= _DOUBT_P:
             return None
-        setting, value = self._taken[worst]
+        setting, value = self.readings[worst]
         return (
             f"no hypothesis explains the readings: the best has p = {p_value:.1g} and is worst at reading {worst + 1} "
             f"({value:g} at {setting}); the model leaves something out, the prior excludes the truth, or the noise is "
@@ -482,8 +485,8 @@ class Inquiry(ShowsItself):
         Of more than 64 settings, it is the best of the 32 that a rougher estimate ranks highest.
         """
         if self._next is None:
-            self._next = self._settings[self._best_row()]
-        return self._next
+            self._next = self._best_row()
+        return self._settings[self._next]
 
     @own_arithmetic
     def tell(self, reading: float, setting: Any = None) -> None:
@@ -509,7 +512,8 @@ class Inquiry(ShowsItself):
         if setting is None and self._next is None:
             way_out = "tell(reading, setting); next() has chosen none since the last reading"
             raise ParameterError("setting", None, f"the setting of this reading: {way_out}")
-        at = self._settings.checked_setting(self._next if setting is None else setting)
+        chosen = self._settings.take(np.array([self._next or 0]))
+        at = chosen if setting is None else self._settings.checked_setting(setting)
         last = ReadingsProblem(self._model, at, np.array([0]), np.array([value]))
         readings = last if self._readings is None else self._readings.with_reading(last)
         of_prior = self._prior_log_likelihood + last.evaluate(self._prior_theta)[:, 0]
@@ -523,7 +527,7 @@ class Inquiry(ShowsItself):
             self._lost_nats = max(by_prior - found.log_z, 0.0)
         self._particles, self._prior_log_likelihood = found, of_prior
         self._readings = readings
-        self._taken = [*self._taken, (at[0], value)]  # a copy of this inquiry keeps those it has
+        self._taken = [*self._taken, (at, value)]  # a copy of this inquiry keeps those it has
         self._utility = self._next = None
         self.__dict__.pop("_hypotheses", None)
 
@@ -632,7 +636,7 @@ class Inquiry(ShowsItself):
     @property
     def _last_setting(self) -> Any:
         """Setting of the last reading; None before the first."""
-        return self._taken[-1][0] if self._taken else None
+        return self._taken[-1][0][0] if self._taken else None
 
     def _costs_s(self, last: Any) -> FloatArray:
         """Return the seconds of a reading at each setting after one at `last`, (n_settings,) or a number; default 1.
@@ -657,7 +661,8 @@ def _checked_goal(goal: Mapping[str, float] | None, names: tuple[str, ...]) -> d
     if goal is None:
         return {}
     require(isinstance(goal, Mapping) and goal, "goal", goal, 'posterior sds by parameter, such as {"centre_hz": 0.5}')
-    for name, sd in goal.items():
+    sds = {name: checked_finite_number(f"goal[{name!r}]", sd) for name, sd in goal.items()}
+    for name, sd in sds.items():
         require(name in names, "goal", name, f"parameters among {', '.join(names)}{did_you_mean(name, names)}")
-        require(checked_finite_number(f"goal[{name!r}]", sd) > 0, f"goal[{name!r}]", sd, "greater than 0")
-    return dict(goal)
+        require(sd > 0, f"goal[{name!r}]", sd, "greater than 0")
+    return sds

@@ -1,6 +1,7 @@
 """What a newcomer gets wrong first is said in words, where it is made: never a KeyError or a TypeError from below."""
 
 import warnings
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -16,13 +17,14 @@ from probewise.effects import VOCABULARY
 from probewise.errors import NotConvergedError, ProbewiseError
 from probewise.experiment import Experiment, Exploration
 from probewise.inference import GaussianKnown, Naive, Rounded, SensorProblem, StudentT
+from probewise.inquiry import Grid
 from probewise.investigation import investigate
 from probewise.nested import RemainingEvidence, diversify, run
 from probewise.priors import Product, Uniform
 from probewise.recordings import HalfPlane, Plan, Recording, read_recording, write_recording
 from probewise.scene import Circle, HypothesisScene
 from probewise.sensor import Chain, FixedLevels, FixedMixture, FreeLevels
-from probewise.systems import Simulator, predict_system
+from probewise.systems import RunTable, Simulator, predict_system
 from probewise.world import Blob, World, gaussian_spot
 
 RNG = np.random.default_rng(0)
@@ -133,6 +135,15 @@ MISTAKES = {
     "a ragged column": (
         lambda: fitted(OVEN, {**TABLE, "temp_c": [[1], [1, 2]]}),
         "column 'temp_c' is .*numbers, in an",
+    ),
+    "half a scan": (lambda: replace(PLAN, scan=PLAN.scan + 0.5), "scan is .*allowed: whole numbers"),
+    "a word for a number of places": (lambda: Grid(n_x="many"), "n_x is 'many'; allowed: a whole number, 2"),
+    "a word for truth": (lambda: Circle(inside="no"), "inside is 'no'; allowed: True or False"),
+    "columns for a column": (lambda: RunTable(TABLE, time=["t_s"]), "time is .*allowed: the name of a column"),
+    "a masked name": (lambda: arrays(scan=np.ma.array(["a"] * 30, mask=[1] * 30)), r"scan\[0\] is .*a name in every"),
+    "a transform to words": (
+        lambda: sampled(lambda p: 0.0, lambda u: "far", names=["x"]),
+        "what the prior makes .* is 'far'; allowed: numbers",
     ),
     "no parameter": (lambda: inquiry(prior={}), r"prior is \{\}; allowed: one parameter or more"),
     # randomness

@@ -85,9 +85,14 @@ def read_only_floats(values: ArrayLike, name: str = "values") -> FloatArray:
     return array
 
 
-def frozen_int(values: ArrayLike) -> IntArray:
-    """Copy numbers to a read-only array of integers."""
-    array = np.array(values, dtype=np.int64)
+def frozen_int(values: ArrayLike, name: str = "values") -> IntArray:
+    """Copy whole numbers to a read-only array of integers; ParameterError for any others."""
+    numbers = array_or_none(values)
+    if numbers is None or numbers.dtype.kind not in "iu":
+        numbers = floats(values, name)
+        whole = (np.abs(numbers) < 2**53) & (numbers == np.floor(numbers))
+        require(whole.all(), name, values, "whole numbers")
+    array = np.array(numbers, dtype=np.int64)
     array.flags.writeable = False
     return array
 

@@ -9,6 +9,7 @@ from itertools import product
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray, read_only_floats
+from probewise._kinds import checked_finite_number, checked_whole
 from probewise.errors import ShapeError, require
 from probewise.recordings.plan import Plan
 
@@ -26,9 +27,10 @@ class Grid:
 
     def __post_init__(self) -> None:
         for name in ("width_mm", "height_mm"):
-            require(0 < getattr(self, name) < np.inf, name, getattr(self, name), "finite, greater than 0")
+            length_mm = checked_finite_number(name, getattr(self, name))
+            require(length_mm > 0, name, length_mm, "finite, greater than 0")
         for name in ("n_x", "n_y"):
-            require(getattr(self, name) >= 2, name, getattr(self, name), "2 or more")
+            checked_whole(name, getattr(self, name), least=2)
 
     @property
     def n_places(self) -> int:

@@ -106,7 +106,7 @@ class ReadingNoise:
         if sd is not None:
             return np.asarray(np.broadcast_to(sd[:, None], predicted.shape))
         if not callable(self.sd):
-            return np.full(predicted.shape, float(self.sd))
+            return np.full(predicted.shape, float(self.sd))  # type: ignore[arg-type]
         sds = np.asarray(self.sd(predicted.ravel()), dtype=np.float64)
         if sds.shape not in ((), (predicted.size,)):
             allowed = f"({predicted.size},), one for each predicted reading"

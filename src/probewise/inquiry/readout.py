@@ -9,6 +9,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from probewise._arrays import FloatArray, IntArray
+from probewise._kinds import checked_number
 from probewise.errors import require
 from probewise.priors import Prior
 
@@ -74,6 +75,8 @@ class Readout:
     high: float = math.inf
 
     def __post_init__(self) -> None:
+        for name in ("noise_sd", "low", "high", *["step"] * (self.step is not None)):
+            checked_number(name, getattr(self, name))
         require(0 < self.noise_sd < math.inf, "noise_sd", self.noise_sd, "finite, greater than 0")
         require(self.step is None or 0 < self.step < math.inf, "step", self.step, "finite, greater than 0, or None")
         require(self.low < self.high, "(low, high)", (self.low, self.high), "low < high")

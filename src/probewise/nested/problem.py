@@ -11,7 +11,7 @@ from typing import Any, Protocol, Self, TypeAlias, cast
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise._arrays import BoolArray, FloatArray, IntArray, floats
 from probewise._kinds import checked_texts, require_callable, require_like
 from probewise.errors import NotConvergedError, ParameterError, message_of, require
 from probewise.priors import Coordinates, Marginal, Prior, Product, parse_prior, require_prior
@@ -421,6 +421,9 @@ def as_problem(
     return make_problem(function, prior, names=names, vectorized=vectorized, pass_dict=pass_dict, periodic=periodic)
 
 
+_FROM_CUBE = "what the prior makes of a point of the unit cube"
+
+
 @dataclass(frozen=True)
 class _TransformPrior:
     """A prior given only as a function from the unit cube, without density or inverse."""
@@ -440,8 +443,8 @@ class _TransformPrior:
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
         # Many transforms modify their argument in place and return it.
         if self.vectorized:
-            return np.asarray(self.function(u.copy()), dtype=np.float64)
-        return np.array([np.array(self.function(row.copy()), dtype=np.float64) for row in u]).reshape(len(u), -1)
+            return floats(self.function(u.copy()), _FROM_CUBE)
+        return np.array([floats(self.function(row.copy()), _FROM_CUBE).ravel() for row in u]).reshape(len(u), -1)
 
 
 @dataclass(frozen=True)

@@ -263,5 +263,10 @@ def _checked_name(what: str, text: str) -> str:
 
 
 def _is_missing(cell: object) -> bool:
-    """Return whether a cell is None, NaN, or a data frame's marker of a missing value."""
-    return cell is None or (isinstance(cell, float) and math.isnan(cell)) or str(cell) in ("<NA>", "NaT")
+    """Return whether a cell is None, NaN, masked, or a data frame's marker of a missing value."""
+    return (
+        cell is None
+        or cell is np.ma.masked
+        or (isinstance(cell, float) and math.isnan(cell))
+        or str(cell) in ("<NA>", "NaT")
+    )

@@ -116,21 +116,22 @@ class Plan:
     sessions: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
+        for name in ("scan_names", "pattern_names"):
+            names: Any = getattr(self, name)
+            several = isinstance(names, Sequence | np.ndarray) and not isinstance(names, str)
+            if not (several and all(issubclass(kind, str) for kind in {*map(type, names)})):
+                raise ParameterError(name, names, "a tuple of texts")
         if len(self.sessions) not in (0, len(self.scan_names)):
             raise ParameterError("sessions", self.sessions, f"one number per scan ({len(self.scan_names)}), or none")
         sessions = tuple(checked_whole("sessions", each, least=0, most=None) for each in self.sessions)
         object.__setattr__(self, "sessions", sessions)
-        for name in ("scan_names", "pattern_names"):
-            names: object = getattr(self, name)
-            if isinstance(names, str) or not all(issubclass(kind, str) for kind in {*map(type, getattr(self, name))}):
-                raise ParameterError(name, names, "a tuple of texts")
         require_kind("patterns", self.patterns, Mapping, "patterns by name: {'edge': HalfPlane(...)}")
         require_patterns(self.patterns)
         require_kind("instrumentation", self.instrumentation, Instrumentation, "an Instrumentation(unit=...)")
         n_points = np.size(self.x_mm)
         numbers = ("x_mm", "y_mm", "orientation_rad", "time_s")
         arrays: dict[str, FloatArray | IntArray] = {n: read_only_floats(getattr(self, n), n) for n in numbers}
-        arrays |= {name: frozen_int(getattr(self, name)) for name in ("scan", "pattern")}
+        arrays |= {name: frozen_int(getattr(self, name), name) for name in ("scan", "pattern")}
         for name, values in arrays.items():
             if values.shape != (n_points,):
                 raise ShapeError(f"{name} has shape {values.shape}; allowed: ({n_points},), as x_mm")

@@ -15,7 +15,15 @@ from typing import ClassVar, Protocol
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise._kinds import checked_number, checked_pair, checked_whole, require_kind, require_like
+from probewise._kinds import (
+    checked_number,
+    checked_one_or_several_numbers,
+    checked_pair,
+    checked_whole,
+    require_flag,
+    require_kind,
+    require_like,
+)
 from probewise.errors import ParameterError, require
 from probewise.priors import Prior, Product, Uniform, checked_columns
 from probewise.scene.regions import (
@@ -120,6 +128,7 @@ def _require_bounds_fit_field(shape: Circle | Ellipse | Rectangle | RegularPolyg
     """Raise ParameterError unless 0 < low < high and, if `inside`, the largest shape fits the field."""
     field, bounds = shape.field, getattr(shape, name)
     require_kind("field", field, Field, "a Field: Field(width_mm, height_mm)")
+    require_flag("inside", shape.inside)
     low, high = checked_pair(name, bounds, "(low, high): its prior is even between them")
     require(0 < low < high < math.inf, name, bounds, "0 < low < high, finite")
     fits = not shape.inside or 2 * reach * high < min(field.width_mm, field.height_mm)
@@ -408,8 +417,8 @@ class AnyOf:
         for name, shape in self.shapes.items():
             require_shape(shape, f"shapes[{name!r}]")
         require(self.shapes, "shapes", dict(self.shapes), "one shape or more, by name")
-        weights = tuple(self.weights) or (1.0,) * len(self.shapes)
-        if len(weights) != len(self.shapes) or not all(0 < w < math.inf for w in weights):
+        weights = checked_one_or_several_numbers("weights", self.weights) or (1.0,) * len(self.shapes)
+        if len(weights) != len(self.shapes) or not all(w > 0 for w in weights):
             raise ParameterError("weights", self.weights, f"{len(self.shapes)} numbers greater than 0")
         object.__setattr__(self, "weights", tuple(w / sum(weights) for w in weights))
 

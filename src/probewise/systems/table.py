@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from decimal import Decimal
 from functools import cached_property
 from numbers import Real
+from types import NoneType
 from typing import Any, ClassVar, cast
 
 import numpy as np
@@ -27,7 +28,7 @@ from probewise._arrays import (
     read_only_floats,
     rounding_error,
 )
-from probewise._kinds import checked_path, require_kind
+from probewise._kinds import checked_path, require_kind, require_text
 from probewise.errors import FileError, ParameterError, ShapeError, require
 from probewise.recordings import Instrumentation, Recording
 from probewise.recordings.cells import first_cell_without_number, parsed_numbers, times_to_numbers
@@ -81,6 +82,9 @@ class RunTable:
     first_line: int = 2
 
     def __post_init__(self) -> None:
+        for what, name in (("time", self.time), ("run", self.run)):
+            require_kind(what, name, (str, NoneType), "the name of a column, or None")
+        require_text("time_unit", self.time_unit)
         allowed = "columns by name: a dict of arrays, or a data frame; of a file: read_run_table('DATA.csv', ...)"
         has_one_axis = getattr(self.columns, "ndim", 2) == 1  # a Series, whose items are its rows
         require(hasattr(self.columns, "items") and not has_one_axis, "table", self.columns, allowed)

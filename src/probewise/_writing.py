@@ -150,6 +150,23 @@ def hold_lock(path: str | os.PathLike[str], *, patience_s: float = 0.0) -> Itera
         lock.release()
 
 
+@contextlib.contextmanager
+def hold_lock_as_read(path: Path, read: bytes) -> Iterator[None]:
+    """Hold the lock of a file that is to be continued, whose content was `read` before it was parsed, b"" if missing.
+
+    FileError as `hold_lock` raises it, or if another process has written to the file since.
+    """
+    with hold_lock(path):
+        if content_if_there(path) != read:
+            raise FileError(path, "another process has written to it", "to resume it once more")
+        yield
+
+
+def content_if_there(path: Path) -> bytes:
+    """Return the content of a file; b"" if it is missing."""
+    return path.read_bytes() if path.exists() else b""
+
+
 def checked_output_directory(path: Path, *entries: str, main: str = "", option: str = "--out") -> Path:
     """Check before any work that results can be written there, and return the path, which an `option` has given.
 
@@ -162,7 +179,8 @@ def checked_output_directory(path: Path, *entries: str, main: str = "", option: 
             allowed = f"another folder: this one holds {results} ({name}), with which these results would mix"
             raise ParameterError(option, str(path), allowed)
     _require_short_name(path)
-    nearest = next(p for p in (path, *path.absolute().parents) if os.path.lexists(p))
+    with _errors_of(path, allowed="an existing current folder, or a path that begins with /"):
+        nearest = next(p for p in (path, *path.absolute().parents) if os.path.lexists(p))
     if not nearest.is_dir():
         what = "is no directory" if nearest.is_symlink() else "is a file"
         here = "this" if nearest == path else nearest
@@ -194,8 +212,9 @@ def checked_output_file(path: Path, *inputs: Path | None, option: str = "--out")
     """
     _require_short_name(path)
     require(not path.is_dir(), option, str(path), "a file name; this is a directory")
-    for taken in inputs:
-        if taken is not None and path.exists() and taken.exists() and path.samefile(taken):
+    for taken in filter(None, inputs):
+        same = os.path.realpath(path) == os.path.realpath(taken)
+        if same or (path.exists() and taken.exists() and path.samefile(taken)):
             raise ParameterError(option, str(path), f"another file than the input {taken}")
     if path.exists() and not os.access(path, os.W_OK):
         raise FileError(path, "is write-protected", "a file that you may write to, or a new one")

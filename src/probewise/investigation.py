@@ -244,7 +244,8 @@ class RoundsFolder:
         self.path = path
         file, self._settings = path / _SETTINGS, dict(settings)
         if not resume:
-            if path.exists() and any(path.iterdir()):
+            # A process killed as it wrote may have left a hidden file.
+            if path.exists() and any(not entry.name.startswith(".") for entry in path.iterdir()):
                 found = "an investigation is" if file.exists() else "files of a person are"
                 raise FileError(path, f"{found} in this folder", "--resume to continue it, or another --out")
             return

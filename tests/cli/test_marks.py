@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from probewise.arm import DryRun, LegoArm, read_geometry, shipped_geometry_path
+from probewise.arm.fitting import write_marks
 from probewise.arm.geometry import Accuracy
 from probewise.cli import main
 from probewise.cli._bench import warn_if_place_sd_large
 from probewise.cli.arm import SheetCheck, bring_to_mark, place_after_moves
-from probewise.recordings import paper_plan, write_plan
+from probewise.recordings import hold_lock, paper_plan, write_plan
 
 OFF = {"x_mm": 3, "y_mm": -3, "shoulder_forward_mm": 3, "shoulder_height_mm": -3, "upper_mm": 3, "lower_mm": -3}
 
@@ -66,6 +67,20 @@ def test_an_arm_that_is_built_otherwise_is_fitted_and_records_without_touching_t
     ]
     assert main(again) == 0
     assert (tmp_path / "again.toml").read_text() == out.read_text()
+
+
+def test_marks_that_another_process_has_or_has_added_to_stay_as_they_are(tmp_path, monkeypatch, capsys):
+    words = ["arm", "fit-geometry", "--arm", "emulator", "--out", str(tmp_path / "a.toml"), "--resume"]
+    kept = tmp_path / "a.marks.csv"
+    write_marks([[0.1, 0.2, 0.3, 500, 250, 32]], kept)
+    before = kept.read_bytes()
+    with hold_lock(kept):
+        assert main(words) == 2
+    assert "a.marks.csv: another process is writing to it" in capsys.readouterr().err
+    monkeypatch.setattr("probewise.cli.arm.content_if_there", lambda path: b"an earlier one")
+    assert main(words) == 2
+    assert "a.marks.csv: another process has written to it; allowed: to resume it once" in capsys.readouterr().err
+    assert kept.read_bytes() == before
 
 
 def test_an_arm_that_is_known_less_well_than_a_shape_is_to_be_says_so_before_it_moves(capsys):

@@ -125,6 +125,18 @@ def test_a_recording_whose_readings_are_all_missing_so_far_goes_on(record, tmp_p
     np.testing.assert_array_equal(read_recording(tmp_path / "r.csv").readings, [np.nan, np.nan, 2.5, 2.5])
 
 
+def test_a_session_that_ended_before_its_first_reading_is_in_nobodys_way(record, tmp_path, capsys):
+    assert record(plan()) == 0
+    (tmp_path / "r.csv").unlink()
+    assert record(plan(), "--resume") == 2
+    assert "r.csv: no such file; allowed: a recording to resume; omit --resume" in capsys.readouterr().err
+    assert record(plan()) == 0
+    (tmp_path / "r.csv").unlink()
+    (tmp_path / "r.json").write_text("of a person")
+    assert record(plan()) == 2
+    assert "r.json: the file exists already" in capsys.readouterr().err
+
+
 def test_a_plan_where_the_recording_should_be_is_refused(record, tmp_path, capsys):
     write_plan(plan(), tmp_path / "r.csv")
     assert record(plan(), "--resume") == 2

@@ -15,7 +15,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise._signals import reporting_what_is_kept
-from probewise._writing import checked_output_file, is_device_or_pipe
+from probewise._writing import checked_output_file, content_if_there, hold_lock_as_read, is_device_or_pipe
 from probewise.arm import (
     Geometry,
     LegoArm,
@@ -49,12 +49,11 @@ from probewise.errors import FileError, LinkError, ParameterError, ReachError, r
 from probewise.recordings import (
     Pattern,
     Plan,
-    hold_lock,
     write_bytes_atomically,
     write_recording,
     write_text_atomically,
 )
-from probewise.recordings.files import pictures_to_write
+from probewise.recordings.files import description_text, pictures_to_write
 from probewise.scene import region_of
 
 _UNITS = "LEGO units (1 dark to 100 bright)"
@@ -110,7 +109,7 @@ def _report_geometry_and_reach(arguments: argparse.Namespace, geometry: Geometry
     tell = partial(say, arguments)
     out, drawing, own = arguments.out, arguments.drawing, arguments.geometry
     out = out and checked_output_file(out, own)
-    drawing = drawing and checked_output_file(drawing, own, option="--drawing")
+    drawing = drawing and checked_output_file(drawing, own, out, option="--drawing")
     port = None if arguments.arm is None else _bench.nxt_port(arguments.arm)
     x_mm, y_mm = (np.linspace(0.0, length, n) for length, n in zip(geometry.field_mm, (131, 65), strict=True))
     places = np.stack(np.meshgrid(x_mm, y_mm), axis=-1).reshape(-1, 2)
@@ -289,7 +288,8 @@ def _height_error_in_words(place_mm: tuple[float, float], off_mm: float, sd_mm: 
 def _fit_geometry_to_marks(arguments: argparse.Namespace, geometry: Geometry) -> None:
     """Bring the sensor to marks, unless there is no --arm; fit the geometry to them, and write it."""
     source = arguments.geometry or shipped_geometry_path()
-    out = checked_output_file(arguments.out, arguments.geometry)
+    built = None if arguments.arm is None else Path(_bench.parse_arm(arguments.arm).where)
+    out = checked_output_file(arguments.out, arguments.geometry, built, arguments.marks)
     require(not arguments.dry_run, "--dry-run", True, "none with fit-geometry: a person directs its moves")
     if arguments.arm is None and arguments.marks is None:
         raise CommandError(f"{_bench.NO_ARM}; or fit existing marks, --marks MARKS.csv")
@@ -297,7 +297,9 @@ def _fit_geometry_to_marks(arguments: argparse.Namespace, geometry: Geometry) ->
         raise ParameterError("--out", str(out), "a file, beside which the marks are kept; or name them with --marks")
     kept = out.with_suffix(".marks.csv") if arguments.marks is None else arguments.marks
     if arguments.arm is not None:
-        _touch_and_save_marks(arguments, geometry, checked_output_file(kept, arguments.geometry, option="--marks"))
+        _touch_and_save_marks(
+            arguments, geometry, checked_output_file(kept, arguments.geometry, built, option="--marks")
+        )
     turned, marks = read_turns_and_places(kept)
     fitted = fit_geometry(geometry, turned, marks, touch_mm=arguments.touch_mm)
     say(arguments, fitted.summary())
@@ -313,6 +315,7 @@ def _touch_and_save_marks(arguments: argparse.Namespace, geometry: Geometry, kep
     require(_bench.parse_arm(arguments.arm).is_lego, "--arm", arguments.arm, allowed)
     if kept.exists() and not arguments.resume:
         raise FileError(kept, "the file exists already", "--resume to continue it, or another --marks")
+    read = content_if_there(kept)
     taken = np.concatenate(read_turns_and_places(kept), axis=1).tolist() if kept.exists() else []
     done = {(x, y) for *_, x, y, _ in taken}
     marks = [(x, y) for x, y in spread_mark_places(geometry).tolist()]
@@ -320,7 +323,7 @@ def _touch_and_save_marks(arguments: argparse.Namespace, geometry: Geometry, kep
     assert isinstance(instrument, LegoArm)
 
     kept_message = partial(message_to_resume, kept, taken.__len__, "mark", arguments, "--resume")
-    with reporting_what_is_kept(kept_message), hold_lock(kept), instrument as arm:
+    with reporting_what_is_kept(kept_message), hold_lock_as_read(kept, read), instrument as arm:
         answer, tell = _bench.prompter_for_answer(arm), print_result if bench is None else lambda text: None
 
         def ask_for_move(mark: str) -> str:
@@ -408,9 +411,10 @@ def _record_plan(arguments: argparse.Namespace, geometry: Geometry) -> None:
     taken: list[Reading] = []
     unshared: AbstractContextManager[None] = contextlib.nullcontext()
     if not arguments.dry_run and not at_end:
+        read = content_if_there(out)
         taken = _earlier_readings(out, plan, resume=arguments.resume, is_lego=chosen is None or chosen.is_lego)
         out.parent.mkdir(parents=True, exist_ok=True)
-        unshared = hold_lock(out)
+        unshared = hold_lock_as_read(out, read)
 
     def kept_message() -> str:
         if at_end:
@@ -462,10 +466,17 @@ def _plan_for_arm(arguments: argparse.Namespace, geometry: Geometry, *, is_own: 
 
 
 def _earlier_readings(out: Path, plan: Plan, *, resume: bool, is_lego: bool) -> list[Reading]:
-    """List the readings of an earlier session, from `out`, which was begun with this plan; none without `resume`."""
-    if resume:
+    """List the readings of an earlier session, from `out`, which was begun with this plan; none without `resume`.
+
+    The description that a session left which ended before its first reading is in nobody's way.
+    """
+    if resume and out.exists():
         return readings_begun_with(plan, out, is_lego=is_lego)
-    for path in (out, out.with_suffix(".json"), *pictures_to_write(plan.patterns, out.parent)):
+    if resume:
+        raise FileError(out, "no such file", "a recording to resume; omit --resume to begin a new one")
+    described = out.with_suffix(".json")
+    left = content_if_there(described) == description_text(plan.instrumentation, plan.patterns).encode()
+    for path in (out, *[described] * (not left), *pictures_to_write(plan.patterns, out.parent)):
         if path.exists():
             raise FileError(path, "the file exists already", "--resume to continue it, or another --out")
     return []

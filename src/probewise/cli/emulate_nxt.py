@@ -33,7 +33,7 @@ def run(arguments: argparse.Namespace) -> int:
     surface = emulator.parse_scene(arguments.scene)
     faults = emulator.Faults.parse(arguments.fault)
     world, _ = world_and_scale(arguments.sensor)
-    with _telegram_log(log) as trace, Terminal(arguments.link) as terminal:
+    with Terminal(arguments.link) as terminal, _telegram_log(log) as trace:  # nothing is emptied before a refusal
         bench = emulator.set_up_bench(
             geometry,
             world,

@@ -78,6 +78,7 @@ def test_residuals_count_from_the_walk_and_the_lines_contain_it(diagnosis):
         np.testing.assert_allclose(shown.readings_with_walk + shown.residuals, y)
         assert np.sqrt(np.mean(shown.residuals**2)) == pytest.approx(rms)
         assert abs(shown.residuals.mean()) < _SD / 2
+    assert "fitted under the noise found, where a fit alone has white noise" in diagnosis.summary()
 
 
 N, SD_OF_IMPOSSIBLE = 50, 0.02

@@ -10,7 +10,7 @@ import pytest
 from probewise.diagnosis.advice import Rival, measurement_separating_rivals
 from probewise.diagnosis.diagnose_simulator import diagnose_system, prepare_system
 from probewise.diagnosis.fit import Model
-from probewise.diagnosis.simulator_rows import SimulatorApparatus
+from probewise.diagnosis.simulator_rows import SimulatorApparatus, candidate_runs
 from probewise.recordings import Plan
 from probewise.systems import (
     Law,
@@ -47,6 +47,15 @@ def test_what_is_planned_is_what_a_diagnosis_of_both_tables_predicts(run):
     theta = system.theta(np.zeros((1, 2)))
     predicted = [system.chain(rows, ()).predict(theta, rows)[0] for rows in (plan, both)]
     np.testing.assert_allclose(predicted[0], predicted[1][34:], rtol=1e-9)
+
+
+def test_what_was_the_same_throughout_each_of_several_runs_stays_so_in_a_new_one():
+    columns = {"t_s": np.tile(np.arange(8.0), 2), "load_kg": np.repeat([1.0, 2.0], 8), "run": np.repeat(["a", "b"], 8)}
+    law = Law({"x": 0.0}, lambda s, p, u: {"x": p["gain"] * u["load_kg"]})
+    own = Simulator("x_mm", "mm", {"gain": (0, 1)}, law=law, time="t_s", run="run", controls=("load_kg",))
+    planned = candidate_runs(RunTable(columns, "t_s", "run"), own)
+    assert all(np.ptp(each.plan.columns["load_kg"]) == 0 for each in planned)
+    assert "take a new run like run a with load_kg held at 2" in [each.description for each in planned]
 
 
 _N = 60

@@ -236,6 +236,15 @@ class Diagnosis(Judged, Reported):
         return "corrected in these readings" if self.by_rows else "repaired"
 
     @property
+    def noise_of_residuals_in_words(self) -> str:
+        """Under which noise `before` and `after` are fitted, as written after their rms; "" under white noise."""
+        return (
+            ""
+            if self.noise.model in ("white", "noise_sd")
+            else ", fitted under the noise found, where a fit alone has white noise"
+        )
+
+    @property
     def not_in_model(self) -> str:
         """That the file of the model lacks the correction by rows, or which share of its samples has a formula."""
         model, named = self.apparatus.words.model, [n for n in self.repaired.effects if is_out_of_vocabulary(n)]
@@ -322,7 +331,7 @@ class Diagnosis(Judged, Reported):
         if self.repair_changes_predictions:
             held = f"{gain.heldout_log_density_per_reading:+.4f} ± {gain.heldout_sd:.4f} nats per held-out reading"
             tested = held if gain.heldout_by_scan else "no reading could be held out"
-            rms = f"{gain.rms_before:.4g} -> {gain.rms_after:.4g} {unit}".rstrip()
+            rms = f"{gain.rms_before:.4g} -> {gain.rms_after:.4g} {unit}".rstrip() + self.noise_of_residuals_in_words
             gained = f"log evidence {gain.log_evidence:+.1f} nats, {tested}, rms of the residuals {rms}"
             lines.append(f"{self.after_in_words}: {gained}")
         elif self.verdict == "noise" and gain.log_evidence >= 0.05:  # rounding beyond doubt is in both models

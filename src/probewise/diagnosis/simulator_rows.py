@@ -52,14 +52,16 @@ def candidate_runs(table: RunTable, simulator: Simulator) -> list[Candidate]:
     """List the runs that could be recorded: recorded runs again, reversed, slower, or with a control moved otherwise.
 
     At most four recorded runs are taken, those that differ in their controls; without any, runs can only be repeated. A
-    function of the time may hold for constant controls alone, as a step response does: unless the simulator is a law,
-    only a control that varies in a recorded run does so again.
+    function of the time may hold for constant controls alone, as a step response does, and what is the same throughout
+    each of several runs, such as a start, may have to be: only a control that varies in a recorded run does so again,
+    or any control of a law's only run.
     """
     out, run = list[Candidate](), table.run or unused_name(_RUN, table.columns)
     reading, settable = simulator.reading, [name for name in simulator.controls if name in table.covariates]
     ends = {k: (float(np.nanmin(table.covariates[k])), float(np.nanmax(table.covariates[k]))) for k in settable}
     varies = {name for name in settable for rows in table.rows_by_scan() if np.ptp(table.covariates[name][rows]) > 0}
-    free = set(settable) if simulator.law is not None or table.time is None else varies
+    one_run = len(table.scan_names) == 1 and (simulator.law is not None or table.time is None)
+    free = set(settable) if one_run else varies
     for rows in _rows_of_distinct_runs(table, settable):
         name = table.scan_names[int(table.scan[rows[0]])]
         kept = rows[:: -(-len(rows) // MOST_ADVISED_READINGS)]
@@ -113,7 +115,8 @@ def _variations_of_run(
                 rounded = np.round(values, int(np.ceil(3 - np.log10(span))))
                 values = np.where((values == low) | (values == high), values, rounded)
             text = said.format(low=f"{low:.4g}", high=f"{high:.4g}", middle=f"{middle:.4g}")
-            yield f"{name} {kind}", f"take {of} with {name} {text}", {name: values}, 1.0
+            again = "" if name in free else "a new run like "
+            yield f"{name} {kind}", f"take {again}{of} with {name} {text}", {name: values}, 1.0
 
 
 def _without_rounding_errors(times: FloatArray) -> FloatArray:

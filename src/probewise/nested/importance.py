@@ -64,7 +64,7 @@ class Weighted(Samples):
     def summary(self) -> str:
         """Describe evidence and posterior in plain text."""
         lines = [
-            f"log Z        {self.log_z:.3f} ± {self.log_z_error:.3f}",
+            f"log Z        {self.log_z:.3f} ± {self.log_z_error:.3f} (of the peaks found; a missed one would add)",
             f"samples      {len(self.theta)}, effective sample size {self.n_eff:.0f}",
             f"cost         {self.n_calls} likelihood evaluations",
             f"weights      Pareto k = {self.pareto_k:.2f}",
@@ -343,7 +343,8 @@ def refine(
     the share of the posterior that the proposal misses. The error includes that; what a heavy tail of the weights adds,
     which slows the convergence of their mean; and that the run may have lost a mode: with n_live points and information
     H (nats) it knows the shares of modes as n_live / H independent samples do, so that a mode of share s is lost with
-    probability exp(-s n_live / H). The sum of s times that over the modes found is added.
+    probability exp(-s n_live / H). The sum of s times that over the modes found is added. A mode that the run missed
+    is in neither number: its error says nothing of it, and only another run, or more live points, can find it.
 
     `result` is a run of the same problem, or an earlier refinement. Raises ParameterError if an option is out of range,
     the run has other parameters, or the prior has neither `to_unit_cube` nor coordinates; NotConvergedError if the

@@ -159,10 +159,11 @@ def _rms_in_words(diagnosis: Diagnosis) -> str:
     """Write the rms of the residuals as calibrated, and after a repair that changes them."""
     gain, unit = diagnosis.improvement, diagnosis.recording.plan.instrumentation.unit_after_number
     before = f"{gain.rms_before:.3g} {unit}{diagnosis.recording.weighting_in_words}"
+    under = diagnosis.noise_of_residuals_in_words
     if not diagnosis.repair_changes_predictions:
-        return before
+        return f"{before}{under}"
     after = typeset_numbers(f"{gain.rms_after:.3g} {diagnosis.after_in_words}")
-    return f"{before} {diagnosis.apparatus.words.before_in_words}, {after}"
+    return f"{before} {diagnosis.apparatus.words.before_in_words}, {after}{under}"
 
 
 def _formula_in_words(formula: Formula) -> str:

@@ -76,7 +76,7 @@ def test_one_sentinel_is_noise_and_neither_model_is_bent_by_it():
     diagnosis = diagnose_system(OVEN, oven(r17=999.0), rng=np.random.default_rng(1))
     assert (diagnosis.verdict, diagnosis.combination) == ("noise", ("dropouts",))
     assert diagnosis.p_value > 0.05
-    assert "row 19 (999)" in diagnosis.recording.notes[0]
+    assert "row 17 (999)" in diagnosis.recording.notes[0]
     (found,) = [effect for effect in diagnosis.effects if effect.name == "dropouts"]
     share, value = found.parameters
     assert share.interval95[0] < 1 / 40 < share.interval95[1]
@@ -97,8 +97,8 @@ def test_a_fit_says_which_row_it_leaves_out_and_which_one_bends_it():
         )
     assert lost.rms < 0.15
     np.testing.assert_allclose(np.median(lost.fitted.samples, axis=0)[:3], list(TRUE.values()), rtol=0.01)
-    assert "left out as lost: row 19 (999)" in " ".join(lost.recording.notes)
-    assert "row 19 (61) carries" in " ".join(bent.recording.notes)
+    assert "left out as lost: row 17 (999)" in " ".join(lost.recording.notes)
+    assert "row 17 (61) carries" in " ".join(bent.recording.notes)
     assert clean.recording.notes == ()
 
 

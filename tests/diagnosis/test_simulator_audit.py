@@ -59,7 +59,7 @@ def test_a_plan_that_lacks_a_cell_is_told_in_which_row():
     """Before, its readings were said to be the same in all rows."""
     x = np.where(np.arange(40) == 7, np.nan, np.linspace(0.0, 1.0, 40))
     simulator = Simulator("y", "V", {"a": (0, 5)}, simulate=lambda p, u: p["a"] * u["x"])
-    with pytest.raises(ParameterError, match="no finite reading in 1 of 40 rows, first in row 9"):
+    with pytest.raises(ParameterError, match="no finite reading in 1 of 40 rows, first in row 7"):
         audit_system(simulator, {"x": x})
 
 

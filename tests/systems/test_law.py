@@ -52,7 +52,7 @@ def test_what_a_tank_spills_into_the_next_one_is_there():
 
 
 def test_time_that_falls_within_a_run_is_refused_with_the_row():
-    with pytest.raises(ParameterError, match=r"in row 4 is .*allowed: .* does not fall"):
+    with pytest.raises(ParameterError, match=r"in row 2 is .*allowed: .* does not fall"):
         steps_for_table(_table([0.0, 1.0, 0.5]), np.inf)
 
 

@@ -131,7 +131,7 @@ def test_the_same_table_twice_or_texts_where_the_first_has_numbers_are_refused()
     second = runs((25.0,), names="7")
     cells = second.columns["room_c"].astype(str)
     cells[2] = "warm"
-    with pytest.raises(ParameterError, match=r"column 'room_c' of b.csv in row 4 is 'warm'"):
+    with pytest.raises(ParameterError, match=r"column 'room_c' of b.csv in row 2 is 'warm'"):
         concatenate_tables([runs(), second.with_columns({"room_c": cells})], ["a.csv", "b.csv"])
 
 
@@ -142,3 +142,12 @@ def test_runs_named_by_numbers_are_joined_with_runs_named_by_texts():
     assert joined.scan_names == ("1", "2", "1 again")
     assert list(joined.columns) == ["day", "x"]
     assert concatenate_tables([advised, first], ["next.csv", "a.csv"])[0].scan_names == ("1 again", "1", "2")
+
+
+def test_rows_of_a_data_frame_are_called_as_its_index_shows_them():
+    pandas = pytest.importorskip("pandas")
+    frame = pandas.DataFrame({"t_s": [0.0, 1.0, 0.5]}, index=["mon", "tue", "wed"])
+    with pytest.raises(ParameterError, match=r"in row wed is 0.5"):
+        RunTable(frame, "t_s").require_rising_time()
+    with pytest.raises(ParameterError, match=r"t in row 8 is 'noon'"):
+        RunTable(pandas.DataFrame({"t": ["10:00:00", "noon"]}, index=[7, 8]), "t")

@@ -599,7 +599,7 @@ def _point_where_readings_vary(system: System, table: RunTable) -> tuple[FloatAr
         never &= ~np.isfinite(predicted)
         is_constant |= bool(np.isfinite(predicted).all())
     if never.any():
-        first = int(np.argmax(never)) + table.first_line
+        first = table.row_name(int(np.argmax(never)))
         found = f"no finite reading in {int(never.sum())} of {len(table)} rows, first in row {first}"
         raise ParameterError("the table", found, "a number in each cell that the simulator reads")
     if not is_constant:

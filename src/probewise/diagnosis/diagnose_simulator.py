@@ -350,7 +350,7 @@ def _note_on_gaps_without_runs(simulator: Simulator, table: RunTable) -> tuple[s
     long = np.flatnonzero(gaps > _LONG_GAP * np.median(gaps[gaps > 0]))
     if gaps[long].sum() <= 0.5 * gaps.sum():
         return ()
-    at = table.first_line + int(long[0])
+    at = table.row_name(int(long[0]))
     said = f"the time jumps by {gaps[long[0]]:.4g} {simulator.time_unit} after row {at}"
     return (f"{said}; if separate runs begin at such jumps, a column that names them, and run = its name, say so",)
 
@@ -411,7 +411,7 @@ def without_unpredictable_readings(system: System, recording: RunRecording, *, e
             missing[rows] = np.maximum.accumulate(missing[rows])
     wrong = np.flatnonzero((unpredictable if every_row else lost) & ~missing)
     if wrong.size:
-        where = f"no finite reading in {len(wrong)} of {len(table)} rows, first in row {wrong[0] + table.first_line}"
+        where = f"no finite reading in {len(wrong)} of {len(table)} rows, first in row {table.row_name(wrong[0])}"
         way_out = (
             "a table without these rows" if law is None else "for a state far faster than the rows its equilibrium"
         )
@@ -431,7 +431,7 @@ def without_unpredictable_readings(system: System, recording: RunRecording, *, e
     why = "simulator reads is missing there"
     if law is not None:
         more = f" and {len(gaps) - 1} more" if len(gaps) > 1 else ""
-        why = f"law reads is missing in row {gaps[0] + table.first_line}{more}, and a law ends at the first gap of its "
+        why = f"law reads is missing in row {table.row_name(gaps[0])}{more}, and a law ends at the first gap of its "
         why += "run; fill the gaps in to use them"
     note = f"{count_with_noun(int(lost.sum()), 'reading')} left out: a column that the {why}"
     return _without_readings(recording, lost, note)

@@ -252,8 +252,9 @@ def note_on_improbable_rows(found: Fit, recording: Recording) -> tuple[str, ...]
 
 
 def rows_in_words(recording: Recording, rows: IntArray) -> str:
-    """Write rows (counted from 0) as a table counts them, its header being row 1, with their readings."""
-    first = ", ".join(f"row {row + 2} ({recording.readings[row]:.6g})" for row in rows[:3].tolist())
+    """Write rows (counted from 0) as their table calls them, or a file whose header is row 1, with their readings."""
+    name: Callable[[int], object] = getattr(recording.plan, "row_name", lambda row: row + 2)
+    first = ", ".join(f"row {name(row)} ({recording.readings[row]:.6g})" for row in rows[:3].tolist())
     return first + (f" and {len(rows) - 3} more" if len(rows) > 3 else "")
 
 

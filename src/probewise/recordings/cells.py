@@ -260,7 +260,9 @@ def times_to_numbers(name: str, values: ArrayLike, unit: str = "s") -> tuple[Arr
         seconds = np.array([(cell - cells[0]).total_seconds() for cell in cells])
         return _in_unit(name, seconds, str(cells[0]), unit)
     except UnclearCellError as error:
-        where = f"{name} in row {error.index} (the first is 0)"
+        index = getattr(values, "index", None)  # of a column of a data frame; a list has a method of this name
+        row = f"{error.index} (the first is 0)" if index is None or callable(index) else index[error.index]
+        where = f"{name} in row {row}"
         raise ParameterError(where, str(cells[error.index]), error.allowed) from error
 
 

@@ -90,14 +90,14 @@ def as_recording(simulator: Simulator, table: RunTable) -> RunRecording:
     readings = table.columns.get(simulator.reading, np.full(len(table), np.nan))
     if readings.dtype != np.float64 or np.isinf(readings).any():
         allowed = "a number in each row, or nothing where it is missing"
-        raise column_error(f"reading {simulator.reading!r}", readings, allowed, first=table.first_line)
+        raise column_error(f"reading {simulator.reading!r}", readings, allowed, row_name=table.row_name)
     own, sd_column = replace(table, instrumentation=instrument), sd if isinstance(sd, str) else ""
     recording = RunRecording(cast(Plan, own), np.array(readings), simulator.source, sd_column=sd_column)
     if recording.sd_column in table.covariates:
         values = table.covariates[recording.sd_column]
         wrong = np.flatnonzero(recording.usable & ~(np.isfinite(values) & (values > 0)))
         if wrong.size:
-            name = f'noise["sd"], column {sd!r} in row {wrong[0] + table.first_line}'
+            name = f'noise["sd"], column {sd!r} in row {table.row_name(wrong[0])}'
             raise ParameterError(name, float(values[wrong[0]]), "greater than 0 wherever there is a reading")
     return recording
 
@@ -177,7 +177,7 @@ def predict_system(
             expected, noise = known.condition(noise, sd, earlier - mean[:, :before])
             mixture.add(mean[:, before:] + expected, noise, between)
     if n_failed == n_samples:
-        at = f"in {int(never.sum())} of {len(own)} rows, first in row {int(np.argmax(never)) + own.first_line}"
+        at = f"in {int(never.sum())} of {len(own)} rows, first in row {own.row_name(int(np.argmax(never)))}"
         found = f"no finite reading {at}" if never.any() else "no finite reading"
         allowed = "finite readings of all rows for some of the samples"
         raise ParameterError("simulate" if system.caller else "rates", found, allowed)
@@ -187,7 +187,7 @@ def predict_system(
     mean, sd, scores = mixture.mean_sd_and_log_density()
     if lost.any():
         mean, sd = np.where(lost, np.nan, mean), np.where(lost, np.nan, sd)
-        first_lost = int(np.argmax(lost)) + own.first_line
+        first_lost = own.row_name(int(np.argmax(lost)))
         rows = f"{count_with_noun(int(lost.sum()), 'row')} cannot be predicted, first row {first_lost}"
         why = "a number that they need is missing; where an effect looks back to it, it is interpolated"
         warn(f"{rows}: {why}", DoubtfulResultWarning)
@@ -208,7 +208,8 @@ def _with_recorded_rows_before(fitted: FittedSystem, table: RunTable) -> tuple[R
         if earlier is None or earlier.dtype.kind != values.dtype.kind:
             earlier = np.full(len(recorded), np.nan if values.dtype == np.float64 else "")
         columns[name] = np.concatenate([earlier[rows], values])
-    return replace(table, columns=columns, first_line=table.first_line - len(rows), notes=()), rows
+    names = (*rows.tolist(), *table.row_names) if table.row_names else ()
+    return replace(table, columns=columns, first_line=table.first_line - len(rows), row_names=names, notes=()), rows
 
 
 def _recorded_before(
@@ -315,7 +316,7 @@ def _filled_table_and_mask(chain: SystemChain, theta: FloatArray, table: RunTabl
             lost |= ~np.isfinite(table.covariates[name])
             lost |= ~np.isfinite(bare.predict(few[:, : chain.system.n_params], alone)).any(axis=0)
     if lost.all():
-        row = int(np.argmax(~np.isfinite(table.covariates[needed[0]]))) + table.first_line
+        row = table.row_name(int(np.argmax(~np.isfinite(table.covariates[needed[0]]))))
         raise ParameterError(f"column {needed[0]!r}", f"no number in row {row}", "a number where a prediction needs it")
     return table.with_columns({name: filled[name] for name in needed}), lost
 

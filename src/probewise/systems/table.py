@@ -6,7 +6,7 @@ import contextlib
 import hashlib
 import itertools
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from decimal import Decimal
 from functools import cached_property
@@ -67,8 +67,11 @@ class RunTable:
     first_row
         Number of the first row, counted from the first row of the recording to which effects are bound: 0 for that
         recording, its length for a table that follows it.
-    notes, first_line
-        How columns were read that are not plain numbers; row of the file, from 1, in which the first row stands.
+    notes
+        How columns were read that are not plain numbers.
+    first_line, row_names
+        How messages call the rows: by their line in the file, from 1, or from 0 in memory; or by their labels in the
+        index of a data frame, if these are others.
     """
 
     columns: Mapping[str, NDArray[Any]]
@@ -79,7 +82,8 @@ class RunTable:
     first_row: int = 0
     time_unit: str = "s"
     notes: tuple[str, ...] = ()
-    first_line: int = 2
+    first_line: int = 0
+    row_names: tuple[object, ...] = ()
 
     def __post_init__(self) -> None:
         for what, name in (("time", self.time), ("run", self.run)):
@@ -109,6 +113,8 @@ class RunTable:
             if values.shape != (n_points,):
                 raise ShapeError(f"column {name!r} has shape {values.shape}; allowed: ({n_points},), as the others")
         require(n_points > 0, "table", "without a row", "one row or more")
+        if (index := getattr(self.columns, "index", None)) is not None:  # of a data frame
+            object.__setattr__(self, "row_names", tuple(index.tolist()))
         object.__setattr__(self, "columns", columns)
         object.__setattr__(self, "notes", tuple(dict.fromkeys(notes)))
         for what, column in (("time", self.time), ("run", self.run)):
@@ -117,7 +123,7 @@ class RunTable:
             values = columns[self.time]
             if values.dtype != np.float64 or not np.isfinite(values).all():
                 allowed = "a time, a finite number, in each row"
-                raise column_error(f"column {self.time!r}", values, allowed, missing=False, first=self.first_line)
+                raise column_error(f"column {self.time!r}", values, allowed, missing=False, row_name=self.row_name)
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values())))
@@ -188,7 +194,7 @@ class RunTable:
             falls = np.flatnonzero(np.diff(self.time_s[rows]) < 0)  # row numbers, where no time is, rise
             if falls.size:
                 before, at = rows[falls[0]], rows[falls[0] + 1]
-                where = f"column {self.time!r} in row {at + self.first_line}"
+                where = f"column {self.time!r} in row {self.row_name(at)}"
                 anew = 'its run; where it begins anew name the runs: run = "..."'
                 own = anew if self.run is None else f"run {name}; sort the rows"
                 allowed = f"{self.time_s[before]:g} or more, since time does not fall within {own}"
@@ -202,7 +208,7 @@ class RunTable:
             known = np.where(np.isfinite(values), values, 0.0)
             k = int(np.argmax(np.abs(known)))
             allowed = f"magnitudes up to {LARGEST_IN_FIT:g}: empty such cells, or use a larger unit"
-            where = f"column {name!r} in row {k + self.first_line}"
+            where = f"column {name!r} in row {self.row_name(k)}"
             require(abs(known[k]) <= LARGEST_IN_FIT, where, float(known[k]), allowed)
             span = float(np.ptp(values[np.isfinite(values)]))
             allowed = f"0, or {1 / LARGEST_IN_FIT:g} and more: use a smaller unit"
@@ -223,7 +229,14 @@ class RunTable:
 
     def take(self, rows: IntArray | BoolArray) -> RunTable:
         """Return a table of these rows, given by indices or by a mask, in this order."""
-        return replace(self, columns={name: values[rows] for name, values in self.columns.items()})
+        kept = np.arange(len(self))[rows]
+        names = tuple(self.row_names[k] for k in kept.tolist()) if len(self.row_names) == len(self) else ()
+        return replace(self, columns={name: values[kept] for name, values in self.columns.items()}, row_names=names)
+
+    def row_name(self, row: int) -> str:
+        """Return what messages call a row, counted from 0."""
+        row = int(row)
+        return str(self.row_names[row] if len(self.row_names) == len(self) else row + self.first_line)
 
     def to_frame(self) -> Any:
         """Return a pandas DataFrame of the columns, names of runs as texts; a row per row of the table."""
@@ -305,13 +318,13 @@ def relative_sds_of_column(table: RunTable, column: str, typical: float | None =
 
 
 def column_error(
-    column: str, cells: NDArray[Any], allowed: str, *, missing: bool = True, first: int = 2
+    column: str, cells: NDArray[Any], allowed: str, *, missing: bool = True, row_name: Callable[[int], str]
 ) -> ParameterError:
-    """Return the error of a column of texts that should be numbers: its first wrong cell, with the row in the file."""
+    """Return the error of a column of texts that should be numbers: its first wrong cell, with the name of its row."""
     k = first_cell_without_number(cells.tolist(), missing=missing, largest=np.finfo(np.float64).max)
     if k is None:
         return ParameterError(column, "texts, all of them numbers", f"numbers: {allowed}")
-    return ParameterError(f"{column} in row {k + first}", str(cells[k]), allowed)
+    return ParameterError(f"{column} in row {row_name(k)}", str(cells[k]), allowed)
 
 
 def _other_times(values: NDArray[Any], unit: str) -> str:
@@ -422,7 +435,7 @@ def concatenate_tables(tables: Sequence[RunTable], sources: Sequence[str]) -> tu
     columns = {}
     for name in dict.fromkeys((*first.columns, run)):
         parts = of_run if name == run else [t.columns.get(name) for t in tables]
-        columns[name] = _concatenated_column(name, parts, [len(t) for t in tables], sources)
+        columns[name] = _concatenated_column(name, parts, tables, sources)
     how = tuple(dict.fromkeys(note for table in tables for note in table.notes))
     return replace(first, columns=columns, run=run, notes=how), tuple(notes)
 
@@ -434,18 +447,18 @@ def append_tables(table: RunTable, more: Sequence[RunTable]) -> RunTable:
 
 
 def _concatenated_column(
-    name: str, parts: Sequence[NDArray[Any] | None], lengths: Sequence[int], sources: Sequence[str]
+    name: str, parts: Sequence[NDArray[Any] | None], tables: Sequence[RunTable], sources: Sequence[str]
 ) -> NDArray[Any]:
     first, out = parts[0], list[NDArray[Any]]()
     assert first is not None
     has_texts = any(part is not None and part.dtype != np.float64 for part in parts)
     numeric = first.dtype == np.float64 and not (has_texts and np.isnan(first).all())
-    for part, n, source in zip(parts, lengths, sources, strict=True):
+    for part, table, source in zip(parts, tables, sources, strict=True):
         if part is None:
-            out.append(np.full(n, np.nan) if numeric else np.full(n, ""))
+            out.append(np.full(len(table), np.nan) if numeric else np.full(len(table), ""))
         elif numeric and part.dtype != np.float64:
             allowed = f"a number, or nothing where it is missing, as in {sources[0]}"
-            raise column_error(f"column {name!r} of {source}", part, allowed)
+            raise column_error(f"column {name!r} of {source}", part, allowed, row_name=table.row_name)
         else:
             out.append(part if numeric else np.array([_text(value) for value in part.tolist()]))
     return np.concatenate(out)

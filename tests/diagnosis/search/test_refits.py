@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -131,3 +132,15 @@ def test_what_was_not_refitted_promises_no_more_than_the_refits_kept(prepared):
     assert len(left) >= 2
     assert all(value < max(c.log_z for c in state.candidates.values()) + 3.0 for value in left.values())
     assert state.optimism > 400
+
+
+def test_an_effect_that_a_refit_shows_to_be_insignificant_promises_nothing_under_any_noise(prepared):
+    state = _state(prepared)
+    single = state.refit_with_effect(state.null, "sensitivity:room")
+    improbable = replace(single.evidence["random_walk",], log_z=single.log_z - 10.0)
+    single = state.store_candidate(replace(single, evidence={**single.evidence, ("random_walk",): improbable}))
+    pair = ("offset_drift", "sensitivity:room")
+    state.about_parts |= {(pair, noise): single.log_z + 500.0 for noise in single.evidence}
+    assert state.refit_with_effect(single, "offset_drift") is None
+    assert pair in state.undetected
+    assert max(value for (names, _), value in state.screened_log_evidences().items() if names == pair) < single.log_z

@@ -207,8 +207,8 @@ class SearchState:
         if known is None:
             # Laplace fails where an effect is too small to be significant and the closed form does not; but the
             # closed form takes amplitudes of a sign that the effect cannot have, and the refit has shown that.
-            for noise, value in scores.items():
-                self.about_parts[names, noise] = parent.evidence[noise].log_z + min(value, 0.0) - against
+            for noise, evidence in parent.evidence.items():
+                self.about_parts[names, noise] = evidence.log_z + min(scores.get(noise, 0.0), 0.0) - against
             self.undetected.add(names)
         return known
 

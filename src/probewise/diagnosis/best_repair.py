@@ -87,9 +87,6 @@ def p_value_after(searched: Searched, fit: WeighedFit, after: Linearised, *, rng
     return bayes_factor_p_value(after, searched.template_banks_for_global_test(fit.found), draws)
 
 
-_RUIN = -1.0  # nats per held-out reading below which named effects are withdrawn
-
-
 @dataclass(frozen=True, eq=False)
 class BestRepair:
     """The fit that repairs the model, or the null's, with its noise effects, linearisation and gain over the null."""
@@ -128,7 +125,7 @@ class BestRepair:
 
 def predicts_far_worse(gain: Improvement) -> bool:
     """Return whether a repair predicts held-out readings worse than the null by over one nat per reading."""
-    return gain.heldout_log_density_per_reading < _RUIN
+    return gain.heldout_log_density_per_reading < -1.0
 
 
 def judged_and_best_repair(
@@ -169,10 +166,6 @@ def judged_and_best_repair(
     return judged, best
 
 
-_ABOUT_EQUAL = 5.0  # nats
-_MOST_BASES = 6
-
-
 @dataclass(frozen=True, eq=False)
 class Correction:
     """A correction: `change` of the readings (n_usable,), by basis `columns` (n_usable, k), and gain when held out."""
@@ -190,14 +183,13 @@ class Correction:
 def correct_by_best_basis(found: Fit, problem: Linearised, bases: TemplateBank, part: IntArray) -> Correction:
     """Return the correction of a fit by one basis, with its gain on held-out parts.
 
-    Of the bases whose evidence is within 5 nats of the best, that of the fewest columns is taken.
+    Of the bases whose evidence is within 5 nats of the best, that of the fewest columns is taken: a basis with one
+    amplitude per scan cannot predict the next scan.
 
     `part`: number of the part of each usable row, to hold parts out in turn, (n_usable,).
     """
     scores = bases.log_bayes_factors(problem)[:, 0]
-    # Among bases of about equal evidence, the one with the fewest columns: a basis with one amplitude per scan cannot
-    # predict the next scan.
-    rivals = np.flatnonzero(scores > scores.max() - _ABOUT_EQUAL)
+    rivals = np.flatnonzero(scores > scores.max() - 5.0)
     columns = bases[min(map(int, rivals), key=lambda i: (int(bases.widths[i]), -float(scores[i])))]
     norms = np.sqrt(np.mean(columns**2, axis=0))
     columns = columns[:, norms > 0] / norms[norms > 0]
@@ -251,7 +243,7 @@ def improvement_and_correction(
     plain_z = test.null.evidence[test.null.possible_noise(best.noise)].log_z
     key = (best.fit.n_gaussians, best.fit.names, best.noise)
     log_evidence = searched.evidences.unknown.get(key, plain_z) - plain_z
-    for step in range(_MOST_BASES):
+    for step in range(6):
         if step:
             fixed = correct_by_best_basis(found, problem, searched.misfit_templates.unknown_bases, parts)
         held = fixed.held_out

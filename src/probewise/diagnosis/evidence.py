@@ -134,8 +134,13 @@ def log_evidence_under(found: Fit, laws: Sequence[NoiseLaw], sd_prior: SdPrior |
     def weigh(nodes: Sequence[int], evidences: Callable[..., tuple[FloatArray, ...]]) -> None:
         own = [laws[node] for node in nodes]
         out[nodes], sigma, bend, curvature = evidences(found, own, joined)
-        if sd_prior is not None:
-            peak[:, nodes] = _peak_of_log_sd(own, sigma, bend, curvature)
+        if sd_prior is not None:  # the likeliest log of a reading's sd, and its variance, the parameters integrated out
+            n_points = np.array([law.n_kept for law in own])
+            n_fitted = curvature.shape[1] - np.trace(np.linalg.inv(curvature), axis1=1, axis2=2)
+            more = n_points / np.maximum(n_points - n_fitted, 1.0)  # by which fitted parameters reduce the variance
+            flat = [law.flat > 0 for law in own]
+            more, variance = np.where(flat, [[1.0], [0.0]], [more, more / bend])
+            peak[:, nodes] = np.log(sigma * np.sqrt(more) * [law.sd_factor_of_rounding for law in own]), variance
 
     normal = [node for node, law in enumerate(laws) if law.whitened_density.is_normal]
     chunk = max(NUMBERS // joined.size, 1)
@@ -151,17 +156,6 @@ def log_evidence_under(found: Fit, laws: Sequence[NoiseLaw], sd_prior: SdPrior |
         out += sd_prior.log_density(peak)
     out[np.isnan(out)] = -math.inf  # slopes or residuals whose squares overflow: impossible
     return out, peak
-
-
-def _peak_of_log_sd(
-    laws: Sequence[NoiseLaw], sigma: FloatArray, bend: FloatArray, curvature: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return the likeliest log of a reading's sd, and its variance, (n_laws,), the fit's parameters integrated out."""
-    n_points = np.array([law.n_kept for law in laws])
-    n_fitted = curvature.shape[1] - np.trace(np.linalg.inv(curvature), axis1=1, axis2=2)
-    more = n_points / np.maximum(n_points - n_fitted, 1.0)  # by which parameters that were fitted reduce the variance
-    more, variance = np.where([law.flat > 0 for law in laws], [[1.0], [0.0]], [more, more / bend])
-    return np.log(sigma * np.sqrt(more) * [law.sd_factor_of_rounding for law in laws]), variance
 
 
 def _normal_log_evidences(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray) -> tuple[FloatArray, ...]:
@@ -224,7 +218,6 @@ def _laplace_terms(z: FloatArray, curvature: FloatArray, n_points: int | IntArra
     return np.asarray(widths - 0.5 * np.sum(z**2, axis=1) - 0.5 * n_points * math.log(2 * math.pi))
 
 
-_RESOLVED = 0.6  # posterior sd over the distance of nodes, from which their sum is the integral to a percent
 _EDGE = 1e-6  # of the prior's unit cube
 _ROUNDS = 6
 _REACH = math.sqrt(3)  # of the nodes on both sides of a peak, in posterior sds
@@ -292,7 +285,8 @@ def _coarse_parameters(evidence: NoiseEvidence) -> tuple[IntArray, FloatArray, F
             own = own * ROUNDING
             spacing = float(np.diff(own).min(initial=math.inf)) if len(own) > 1 else 1 / n
             mean = float(marginal @ own)
-            if math.sqrt(float(marginal @ (own - mean) ** 2)) < _RESOLVED * spacing:
+            # From a posterior sd of that share of the distance of nodes on, their sum is the integral to a percent.
+            if math.sqrt(float(marginal @ (own - mean) ** 2)) < 0.6 * spacing:
                 at = unit[int(np.argmax(weights)), k]
                 found.append((part.start + k, float(at), spacing, _rise_between(marginal)))
     columns, peak, spacings, gains = zip(*found, strict=True) if found else ((), (), (), ())
@@ -414,11 +408,6 @@ class Linearised:
             basis, residual = np.concatenate([basis, np.zeros((1, p))]), np.append(residual, rest)
         return cls(basis, residual, law, sd, n_points)
 
-    @property
-    def n_kept(self) -> int:
-        """Number of readings that are not lost; rows of lost ones are 0 and carry no information."""
-        return self.law.n_kept
-
     def whiten(self, columns: FloatArray) -> FloatArray:
         """Whiten columns of readings and divide them by the noise sd, (n_points, k) both."""
         return self.law(columns) / self.sd
@@ -474,7 +463,7 @@ def scale_and_project(problem: Linearised, templates: Sequence[FloatArray]) -> F
     widths = [template.shape[1] for template in templates]
     whitened = problem.law(np.concatenate(templates, axis=1))
     norms = np.sqrt(np.einsum("ij,ij->j", whitened, whitened))
-    whitened *= np.sqrt(problem.n_kept / np.repeat(widths, widths)) / np.where(norms > 0, norms, 1.0)
+    whitened *= np.sqrt(problem.law.n_kept / np.repeat(widths, widths)) / np.where(norms > 0, norms, 1.0)
     return problem.project_whitened(whitened)
 
 

@@ -200,9 +200,6 @@ def _parameter_found(name: str, unit: str, values: FloatArray) -> ParameterFound
     return ParameterFound(name, unit, float(mean[0]), float(sd[0]), (float(low), float(high)))
 
 
-_N_DRAWS_OF_REMAINDER = 199
-
-
 @dataclass(frozen=True)
 class Remainder:
     """A significant misfit that remains after all named effects.
@@ -247,7 +244,7 @@ def remainder_of(searched: Searched, judged: Judged, best: BestRepair, *, rng: n
     more = max(value - log_z, with_formula - log_z, 0.0)
     named = max(log_z - searched.evidences.fits[own, ()].evidence[best.noise].log_z, 0.0)
     prepared, residuals = searched.prepared, best.fit.found.residuals
-    draws = best.problem.draw_null_residuals(_N_DRAWS_OF_REMAINDER, rng=rng)
+    draws = best.problem.draw_null_residuals(199, rng=rng)
     covariates, scans = searched.misfit_templates.covariates, prepared.recording.plan.scan_names
     found = significant_places(best.problem, covariates, scans, residuals, draws)
     where = found[0].covariate if found else None

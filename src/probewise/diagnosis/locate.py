@@ -180,8 +180,8 @@ def significant_places(
     n_draws).
     """
     out: list[Place] = []
-    norms = np.sqrt(np.maximum(np.sum(draws**2, axis=0), TINY) / problem.n_kept)
-    own_norm = math.sqrt(float(problem.residual @ problem.residual) / problem.n_kept) or 1.0
+    norms = np.sqrt(np.maximum(np.sum(draws**2, axis=0), TINY) / problem.law.n_kept)
+    own_norm = math.sqrt(float(problem.residual @ problem.residual) / problem.law.n_kept) or 1.0
     for covariate in covariates:
         columns, windows = window_columns(covariate, problem.n_points)
         if not windows:

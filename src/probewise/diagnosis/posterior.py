@@ -38,7 +38,7 @@ from probewise.diagnosis.evidence import NUMBERS, NoiseEvidence, log_evidence_of
 from probewise.diagnosis.fit import FARTHEST, Fit, Model, fit, fit_each_start, with_prior
 from probewise.diagnosis.noise import LEAST_SCALE, RUNS_AWAY, NoiseLaw, SdPrior
 from probewise.diagnosis.sensors import CalibratedSensor
-from probewise.effects import Effect, HeavyTailedPrior
+from probewise.effects import HeavyTailedPrior
 from probewise.errors import NotConvergedError
 from probewise.nested import Weighted
 from probewise.nested.importance import weighted_draws
@@ -139,14 +139,9 @@ def sizes_with_shape(found: Fit) -> list[int]:
     for effect, columns in effects_with_columns(found.model.effects, found.model.sensor.n_params):
         own = {columns.start + k for k in effect.amplitudes}
         is_shaped = len(effect.prior.names) > 1 and not effect.has_change_point
-        if is_shaped and acts_on_readings(effect) and len(own) == 1 and own <= sizes:
+        if is_shaped and effect.stage >= Stage.SEEN and len(own) == 1 and own <= sizes:
             out.extend(own)
     return out
-
-
-def acts_on_readings(effect: Effect) -> bool:
-    """Return whether an effect changes readings that are simulated already."""
-    return effect.stage >= Stage.SEEN
 
 
 _CREDIBLE = 10.0  # nats below the best mode, up to which another one counts
@@ -180,7 +175,7 @@ class TangentModel:
     def __init__(self, found: Fit, system: System) -> None:
         self.model, self.system, self.z, self.n_params = found.model, system, found.z, found.model.n_params
         upstream = np.ones(self.n_params, dtype=np.bool_)
-        for effect in filter(acts_on_readings, self.model.effects):
+        for effect in (effect for effect in self.model.effects if effect.stage >= Stage.SEEN):
             upstream[self.model.coordinate_slice(effect.name)] = False
         points, steps = found.model.difference_points_and_steps(found.z)
         views = self.model.chain.simulated_view(self.model.theta(points[np.append(True, upstream)]), self.model.plan)
@@ -562,9 +557,6 @@ class _Ridge:
 _ENOUGH = 0.5  # target effective sample size, as a share of the samples wanted
 _LEAST_SHARE = 0.25  # least acceptable effective sample size, likewise
 _ALIKE = 0.98  # effective share of a few draws, from which means of all are off by a seventh of an sd at most
-_EFFECTIVE = 0.5  # least effective share of the samples after a step of beta
-_AT_LAST = 3  # factor on the number of moves at beta = 1
-_LEAST_STEP = 1e-3
 
 Density: TypeAlias = Callable[[FloatArray], FloatArray]
 """Log densities of samples, unnormalised, (n, n_params) -> (n,)."""
@@ -635,9 +627,23 @@ def draw_by_annealing(
         raise NotConvergedError("no sample of the approximate posterior is within the bounds of the prior")
 
     def move(times: int) -> None:
+        """Move one half of the walkers by differences of the other half, then vice versa; adapt the step size."""
         nonlocal z, heights, scale
         for _ in range(times):
-            z, heights, scale = _ensemble_step(z, heights, beta, scale, log_q, log_p, rng=rng)
+            z, heights = z.copy(), heights.copy()
+            order, n, accepted = rng.permutation(n_walkers), n_walkers // 2, 0
+            for own, other in ((order[:n], order[n:]), (order[n:], order[:n])):
+                one, another = (z[rng.choice(other, len(own))] for _ in range(2))
+                length = scale * 2.38 / math.sqrt(2 * z.shape[1]) * rng.choice([1.0, 0.3], (len(own), 1))
+                to = z[own] + length * (one - another)
+                there = np.stack([log_q(to), log_p(to)])
+                taken = np.asarray(np.isfinite(there).all(axis=0))
+                of_q, of_p = (there - heights[:, own])[:, taken]
+                taken[taken] = np.log(rng.random(len(own)))[taken] < (1 - beta) * of_q + beta * of_p
+                z[own[taken]], heights[:, own[taken]] = to[taken], there[:, taken]
+                accepted += int(taken.sum())
+            rate = accepted / n_walkers
+            scale = min(max(scale * (1.3 if rate > 0.35 else 0.75 if rate < 0.15 else 1.0), 0.05), 2.0)
 
     while beta < 1.0:
         gain, before = heights[1] - heights[0], beta
@@ -645,7 +651,7 @@ def draw_by_annealing(
         kept = resampled_rows(np.exp((beta - before) * (gain - gain.max())), n_walkers, rng)
         z, heights = z[kept], heights[:, kept]
         progress("annealing samples to the posterior", note=f"beta {beta:.2f} of 1")
-        move(n_moves if beta < 1.0 else _AT_LAST * n_moves)
+        move(n_moves if beta < 1.0 else 3 * n_moves)
     harvest = [z]
     while len(harvest) * n_walkers < n_wanted:
         progress("sampling the posterior", len(harvest) * n_walkers, n_wanted)
@@ -656,42 +662,11 @@ def draw_by_annealing(
 
 def _next_beta(gain: FloatArray, beta: float) -> float:
     """Find the largest beta, by bisection, at which half of the finite weights are effective samples."""
-    enough = _EFFECTIVE * np.count_nonzero(np.isfinite(gain))
+    enough = 0.5 * np.count_nonzero(np.isfinite(gain))
     if n_effective((1.0 - beta) * gain) >= enough:
         return 1.0
     low = largest_power(lambda power: (power - beta) * gain, beta, wanted=enough)
-    return min(max(low, beta + _LEAST_STEP), 1.0)
-
-
-def _ensemble_step(
-    z: FloatArray,
-    heights: FloatArray,
-    beta: float,
-    scale: float,
-    log_q: Density,
-    log_p: Density,
-    *,
-    rng: np.random.Generator,
-) -> tuple[FloatArray, FloatArray, float]:
-    """Move one half of the walkers by differences of the other half, then vice versa; adapt the step size.
-
-    `heights` (2, n_walkers) are both log densities of the walkers.
-    """
-    z, heights = z.copy(), heights.copy()
-    order, n = rng.permutation(len(z)), len(z) // 2
-    accepted = 0
-    for own, other in ((order[:n], order[n:]), (order[n:], order[:n])):
-        first, second = (z[rng.choice(other, len(own))] for _ in range(2))
-        length = scale * 2.38 / math.sqrt(2 * z.shape[1]) * rng.choice([1.0, 0.3], (len(own), 1))
-        to = z[own] + length * (first - second)
-        there = np.stack([log_q(to), log_p(to)])
-        taken = np.asarray(np.isfinite(there).all(axis=0))
-        of_q, of_p = (there - heights[:, own])[:, taken]
-        taken[taken] = np.log(rng.random(len(own)))[taken] < (1 - beta) * of_q + beta * of_p
-        z[own[taken]], heights[:, own[taken]] = to[taken], there[:, taken]
-        accepted += int(taken.sum())
-    rate = accepted / len(z)
-    return z, heights, min(max(scale * (1.3 if rate > 0.35 else 0.75 if rate < 0.15 else 1.0), 0.05), 2.0)
+    return min(max(low, beta + 1e-3), 1.0)
 
 
 _NEGLIGIBLE = 0.02  # noise sds, over all readings together: smaller changes at one step are neglected
@@ -761,13 +736,8 @@ def surrogate_log_density(
     return log_density
 
 
-_N_WALKERS = 250
 _MOVES = 6  # of each walker after a step of beta
-# Of adaptive importance sampling where it costs little: draws of a round, kernels, rounds, and enough effective draws.
-_SIZES_HERE = 1000, 60, 8, 250.0
-# The surrogate costs next to nothing.
-_N_NEAR = 2000
-_MOVES_NEAR = 20
+_N_NEAR, _MOVES_NEAR = 2000, 20  # of the surrogate, which costs next to nothing
 
 
 def n_tried(model: Model) -> int | None:
@@ -832,7 +802,7 @@ def posterior_draws(
         weighed = importance_resample(first, log_q, log_p, n_wanted=n_wanted, rng=rng, n_tried=tried)
         if weighed is not None:
             return weighed
-        some = first[:_N_WALKERS]
+        some = first[:250]
         return draw_by_annealing(some, log_q, log_p, n_moves=n_moves, n_wanted=n_wanted, rng=rng, progress=progress)
 
     tried, system = n_tried(model), model.sensor
@@ -845,7 +815,8 @@ def posterior_draws(
         # A fit is under the noise that suits it best, which may be another: proposals from there would be far off.
         best = fit(model, recording, found.z, law) if cheap is model else found
         modes = [best, *modes_of_opposite_sign(cheap, best, recording, law)]
-        draws, _ = draw_by_importance(stand_in, modes, law, sizes=_SIZES_HERE, rng=rng, progress=progress)
+        sizes = 1000, 60, 8, 250.0  # draws of a round, kernels, rounds, and enough effective draws: each costs little
+        draws, _ = draw_by_importance(stand_in, modes, law, sizes=sizes, rng=rng, progress=progress)
         if draws.n_eff >= _LEAST_SHARE * n_samples:
             if cheap is model:
                 return draws.samples(n_samples, rng=rng)

@@ -101,7 +101,7 @@ class TemplateBank:
         total = np.maximum(np.sum(own**2, axis=0), TINY)
         out = np.empty((len(self.templates), own.shape[1]))
         for members, _, left, along in self.projected(problem, own):
-            out[members] = _log_bayes_factors_of_grams(left, along, total, problem.n_kept)
+            out[members] = _log_bayes_factors_of_grams(left, along, total, problem.law.n_kept)
         return out[self.which]
 
     def log_bayes_factors_by_label(self, found: Fit, law: NoiseLaw) -> dict[str, FloatArray]:
@@ -437,7 +437,7 @@ def log_bayes_factors_of_pairs(
         at = np.array([both[k] for k in members])
         scale = (per_column[at] / math.sqrt(width))[:, :, None]  # both together of unit rms
         grams = products[at[:, :, None], at[:, None, :]] * scale * scale.transpose(0, 2, 1)
-        together[members] = _log_bayes_factors_of_grams(grams, along[at] * scale, total, problem.n_kept)[:, 0]
+        together[members] = _log_bayes_factors_of_grams(grams, along[at] * scale, total, problem.law.n_kept)[:, 0]
     apart = np.array([singles[a][i] + singles[b][j] for (a, i), (b, j) in asked])
     starts = np.concatenate([[0], np.cumsum([len(best[a]) * len(best[b]) for a, b in pairs])[:-1]])
     gained = np.logaddexp.reduceat(together, starts) - np.logaddexp.reduceat(apart, starts)

@@ -128,7 +128,7 @@ def _cosines(bank: TemplateBank, problem: Linearised, columns: FloatArray) -> It
     """
     for _, _, left, along in bank.projected(problem, columns):
         squares, axes = np.linalg.eigh(left)
-        lengths = np.sqrt(np.where(squares > _ROUNDING * problem.n_kept, squares, np.inf))
+        lengths = np.sqrt(np.where(squares > _ROUNDING * problem.law.n_kept, squares, np.inf))
         yield axes.transpose(0, 2, 1) @ along / lengths[:, :, None]
 
 

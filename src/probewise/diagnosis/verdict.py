@@ -244,13 +244,17 @@ def hypotheses_with_verdict(
 ) -> tuple[tuple[Hypothesis, ...], Names, tuple[Verdict, Names]]:
     """Return the hypotheses, most probable first, the rare effects that they name (or ()), and the verdict on them.
 
-    A combination with effects out of vocabulary counts as unknown, unless these are rare effects that are decided (see
-    `decided_rare_effects`), the p-value of the global test is .01 or less, and the verdict is then that they are named.
+    A combination with effects out of vocabulary counts as unknown, unless these are rare effects that are decided, the
+    p-value of the global test is .01 or less, and the verdict is then that they are named. Decided are those of the
+    leader, no proposed formula, if hardly anything else out of vocabulary explains the readings: of what would count as
+    unknown, the combinations with them have half of the probability, and all others at most a fifth of that.
     """
     posterior, reported_as = searched.posterior, searched.evidences.reported_as
     unknown = {mean: p for mean, p in posterior.marginal_over_noise.items() if reported_as(mean) == UNKNOWN}
-    rare = decided_rare_effects(searched.leading_combination_out_of_vocabulary(), unknown) if p_value <= ALARM else ()
-    if rare:
+    rare = effects_out_of_vocabulary(searched.leading_combination_out_of_vocabulary())
+    own = sum(p for mean, p in unknown.items() if effects_out_of_vocabulary(mean) == rare)
+    is_decided = own >= 0.5 and sum(unknown.values()) - own <= OUT_OF_THE_QUESTION * own
+    if rare and is_decided and p_value <= ALARM and not any(name.startswith(PROPOSAL) for name in rare):
         hypotheses = ranked_hypotheses(
             posterior.probabilities, lambda mean: mean if effects_out_of_vocabulary(mean) == rare else reported_as(mean)
         )
@@ -259,20 +263,6 @@ def hypotheses_with_verdict(
             return hypotheses, rare, (verdict, combination)
     hypotheses = ranked_hypotheses(posterior.probabilities, reported_as, unknown_weight=unknown_weight)
     return hypotheses, (), verdict_on(hypotheses)
-
-
-def decided_rare_effects(leader: Names, unknown: Mapping[Names, float]) -> Names:
-    """Return the rare effects of the `leader` if hardly anything else out of vocabulary explains the readings; else ().
-
-    `unknown` holds the probabilities of all combinations that would count as unknown. Those with the leader's rare
-    effects have half of the probability, and all others together at most a fifth of that. A proposed formula is no rare
-    effect.
-    """
-    rare = effects_out_of_vocabulary(leader)
-    own = sum(p for mean, p in unknown.items() if effects_out_of_vocabulary(mean) == rare)
-    rest = sum(unknown.values()) - own
-    is_formula = any(name.startswith(PROPOSAL) for name in rare)
-    return () if not rare or is_formula or own < 0.5 or rest > OUT_OF_THE_QUESTION * own else rare
 
 
 def with_shared_effects(
@@ -293,7 +283,10 @@ def with_shared_effects(
     shared = shared_effects(probability)
     judged = replace(judged, shared=shared)
     if judged.verdict == "noise" and sum(p for names, p in probability.items() if {*names} <= noise_names) < 0.5:
-        leader = _leader_on_mean(probability, noise_names, judged.aliases) if judged.p_value <= ALARM else ()
+        on_mean = {k: p for k, p in probability.items() if k != UNKNOWN and not {*k} <= noise_names}
+        classes = [_combination_and_alias_swaps(names, judged.aliases) & on_mean.keys() for names in on_mean]
+        likeliest = max(classes, key=lambda members: sum(on_mean[names] for names in members), default=set())
+        leader = max(likeliest, key=lambda names: on_mean[names], default=()) if judged.p_value <= ALARM else ()
         judged = replace(judged, verdict="cannot_tell", combination=leader)
     physics = {*shared} - noise_names
     if judged.verdict != "cannot_tell" or not physics or (judged.p_value > ALARM and not physics <= certain):
@@ -301,13 +294,6 @@ def with_shared_effects(
     leader = max((names for names in probability if {*shared} <= {*names}), key=lambda names: probability[names])
     likely = [name for name in leader if sum(p for names, p in probability.items() if name in names) > 0.5]
     return replace(judged, verdict="named", combination=tuple(sorted({*shared, *likely})), leader=leader)
-
-
-def _leader_on_mean(probability: Mapping[Names, float], of_noise: frozenset[str], aliases: tuple[Alias, ...]) -> Names:
-    physics = {k: p for k, p in probability.items() if k != UNKNOWN and not {*k} <= of_noise}
-    classes = [_combination_and_alias_swaps(names, aliases) & physics.keys() for names in physics]
-    likeliest = max(classes, key=lambda members: sum(physics[names] for names in members), default=set())
-    return max(likeliest, key=lambda names: physics[names], default=())
 
 
 def ranked_hypotheses(

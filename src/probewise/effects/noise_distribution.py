@@ -87,12 +87,6 @@ def _log_of_mixture(
     return np.asarray(out)
 
 
-def reading_variance(noise: NoiseParameters) -> FloatArray:
-    """Return the variance of a reading that is not lost, with outliers, random walk and rounding; arrays broadcast."""
-    wide = 1 + noise.wide_share * (noise.wide_times**2 - 1)
-    return np.asarray(noise.sd**2 * wide + noise.offset_sd**2 + noise.step**2 / 12)
-
-
 @dataclass(frozen=True, eq=False)
 class RecordedBefore:
     """What was recorded before some rows that are to be predicted, by which noise with a memory is known in part.
@@ -226,7 +220,9 @@ class PredictiveMixture:
         apart than the noise; mean and sd are unaffected.
         """
         limited = limited_mean(noise, mean, *self.ends) if np.isfinite(self.ends).any() else mean
-        variance = mean.var(axis=0) + np.broadcast_to(reading_variance(noise), mean.shape).mean(axis=0)
+        wide = 1 + noise.wide_share * (noise.wide_times**2 - 1)
+        own = np.asarray(noise.sd**2 * wide + noise.offset_sd**2 + noise.step**2 / 12)  # of a reading that is not lost
+        variance = mean.var(axis=0) + np.broadcast_to(own, mean.shape).mean(axis=0)
         if self.step is not None:  # not in the variance: the pooled sd includes a declared rounding
             noise = replace(noise, step=np.full((1, 1), self.step))
         if between is not None:

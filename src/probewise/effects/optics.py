@@ -119,7 +119,10 @@ def distinct_scan_lines(plan: Plan) -> tuple[ScanLine, ...]:
         places = np.unique(np.stack([plan.x_mm[rows], plan.y_mm[rows]], axis=-1), axis=0)
         if len(places) < _LEAST_PLACES:
             continue
-        angle = _principal_angle_rad(places)
+        # The angle to X of the principal axis, above -89.5 and up to 90.5 degrees.
+        x_mm, y_mm = (axis - axis.mean() for axis in (places - places[0]).T)  # exactly 0 for an axis that rests
+        angle = 0.5 * float(np.arctan2(2 * x_mm @ y_mm, x_mm @ x_mm - y_mm @ y_mm))
+        angle = angle + np.pi if angle < _LEAST_ANGLE_RAD else angle
         along, across = ScanLine(angle, 0.0, 0.0, 1.0).line_coordinates_mm(*places.T)
         if len(distinct_positions_mm(along)) < _LEAST_PLACES or np.ptp(across) > _STRAIGHT * np.ptp(along):
             continue
@@ -133,13 +136,6 @@ def distinct_scan_lines(plan: Plan) -> tuple[ScanLine, ...]:
         else:
             found.append(line)
     return tuple(found)
-
-
-def _principal_angle_rad(places_mm: FloatArray) -> float:
-    """Return the angle to X of the principal axis of places, (n_places, 2), above -89.5 and up to 90.5 degrees."""
-    x_mm, y_mm = (axis - axis.mean() for axis in (places_mm - places_mm[0]).T)  # exactly 0 for an axis that rests
-    angle = 0.5 * float(np.arctan2(2 * x_mm @ y_mm, x_mm @ x_mm - y_mm @ y_mm))
-    return angle + np.pi if angle < _LEAST_ANGLE_RAD else angle
 
 
 @dataclass(frozen=True)
@@ -456,7 +452,11 @@ def edge_shadow(kind: LightEffect, of: Extent) -> Effect:
     made in different ways, one glued on, another printed: raised edges may belong to all kinds of pattern, to one kind,
     or to all kinds but one.
     """
-    kinds = _groups_of_edged_patterns(of.plan)
+    by_type: dict[type, list[str]] = {}
+    for name, _ in of.plan.rows_by_pattern():
+        if isinstance(pattern := of.plan.patterns.get(name), HalfPlane | Quadrant | Disc | Polygon | Stripes):
+            by_type.setdefault(type(pattern), []).append(name)
+    kinds = [tuple(names) for names in by_type.values()]
     but_one = [tuple(itertools.chain(*kinds[:k], *kinds[k + 1 :])) for k in range(len(kinds))]
     choices = tuple(dict.fromkeys([(), *kinds, *but_one])) if len(kinds) > 1 else ((),)
     found = one_of([edge_shadow_of_patterns(kind, of, patterns) for patterns in choices])
@@ -487,15 +487,6 @@ def edge_shadow_of_patterns(kind: LightEffect, of: Extent, patterns: tuple[str, 
     bank = single_column_bank(1.0, sizes_inside(widths, 6))
     source = partial(edge_shadow_of_patterns, kind, of, patterns)
     return kind.bind(of, parameters, act, says, bank, typical=0.01, patterns=patterns, source=source)
-
-
-def _groups_of_edged_patterns(plan: Plan) -> tuple[tuple[str, ...], ...]:
-    """Return the names of patterns with edges under readings, one group for each type of pattern."""
-    kinds: dict[type, list[str]] = {}
-    for name, _ in plan.rows_by_pattern():
-        if isinstance(pattern := plan.patterns.get(name), HalfPlane | Quadrant | Disc | Polygon | Stripes):
-            kinds.setdefault(type(pattern), []).append(name)
-    return tuple(tuple(names) for names in kinds.values())
 
 
 @light_effect("reflection", Stage.FOOTPRINT, "a reflection beside the spot", ("place", "edge_distance"))

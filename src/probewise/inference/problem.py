@@ -84,11 +84,8 @@ class SensorProblem:
         Hypotheses are processed in blocks to bound the memory.
         """
         at_once = max(_MOST_NUMBERS // max(len(self.recording), 1), 1)
-        if len(theta) > at_once:
-            return np.concatenate(
-                [self._log_likelihood_of_block(theta[at : at + at_once]) for at in range(0, len(theta), at_once)]
-            )
-        return self._log_likelihood_of_block(theta)
+        blocks = [theta[at : at + at_once] for at in range(0, max(len(theta), 1), at_once)]
+        return np.concatenate([self._log_likelihood_of_block(block) for block in blocks])
 
     def _log_likelihood_of_block(self, theta: FloatArray) -> FloatArray:
         usable = self.recording.usable

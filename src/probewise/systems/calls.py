@@ -33,16 +33,6 @@ _WAY_OUT_BY_WORDS = {  # of Python's and NumPy's messages
 }
 
 
-def read_only_views(values: Values) -> dict[str, Any]:
-    """Return values by name with read-only views of the arrays among them, for `call_on_read_only`."""
-    out = dict(values)
-    for name, value in out.items():
-        if isinstance(value, np.ndarray) and value.flags.writeable:
-            out[name] = view = value.view()
-            view.setflags(write=False)
-    return out
-
-
 def call_on_read_only(function: Callable[..., Any], *given: Values) -> Any:
     """Call a user's function with dicts of read-only arrays by name; with copies instead, if it writes into one.
 
@@ -59,7 +49,13 @@ def call_on_read_only(function: Callable[..., Any], *given: Values) -> Any:
 
 def call_on_views(function: Callable[..., Any], *given: Values) -> Any:
     """Call a user's function with values by name, of which it gets read-only views."""
-    return call_on_read_only(function, *map(read_only_views, given))
+    views = [dict(values) for values in given]
+    for own in views:
+        for name, value in own.items():
+            if isinstance(value, np.ndarray) and value.flags.writeable:
+                own[name] = view = value.view()
+                view.setflags(write=False)
+    return call_on_read_only(function, *views)
 
 
 class _CopyingDict(dict[str, Any]):

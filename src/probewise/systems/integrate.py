@@ -271,7 +271,8 @@ def _solve_all_steps(
         samples = np.flatnonzero(search.active & ((search.rate < _SLOW) | ~np.isfinite(search.change)))
         if not samples.size:
             break
-        missed = search.step_residuals(samples)
+        now = search.states[:, samples]
+        missed = search.states_at_step_ends(samples, now) - now[:, :, 1:]  # 0 where a step is solved
         correction = np.empty_like(missed)
         for number in np.unique(nearest[samples]).tolist():
             own = nearest[samples] == number
@@ -330,17 +331,12 @@ class _NewtonState:
         after = self._stepper.step(begins.reshape(len(begins), len(samples), -1), steps.begin, steps.length)
         return after.reshape(begins.shape)
 
-    def step_residuals(self, samples: IntArray) -> FloatArray:
-        """Return each step's end minus the trajectory's state there, (n_states, n, n_steps, n_runs); 0 if solved."""
-        states = self.states[:, samples]
-        return self.states_at_step_ends(samples, states) - states[:, :, 1:]
-
     def bands_and_residuals(self, samples: IntArray, states: FloatArray) -> tuple[list[FloatArray], FloatArray]:
-        """Return samples' Jacobians of the equations of all steps, and the residuals as of `step_residuals`.
+        """Return samples' Jacobians of the equations of all steps, and each step's end minus the trajectory there.
 
-        They are those at states (n_states, n, n_steps + 1, n_runs). A Jacobian is its bands, (n_unknowns, 2 n_states):
-        column k holds the k-th subdiagonal; the diagonal is 1 throughout, and column 0 is not used. Unknowns are
-        ordered by run, then by step, then by state.
+        They are those at states (n_states, n, n_steps + 1, n_runs), the latter (n_states, n, n_steps, n_runs). A
+        Jacobian is its bands, (n_unknowns, 2 n_states): column k holds the k-th subdiagonal; the diagonal is 1
+        throughout, and column 0 is not used. Unknowns are ordered by run, then by step, then by state.
         """
         n_states, n, _, n_runs = states.shape
         nudge = _NUDGE * np.maximum(np.abs(states).max(axis=(2, 3), keepdims=True), TINY)

@@ -60,7 +60,7 @@ class System:
     integrations
         Counts of a law's evaluations and failures, and its trajectories, from which nearby ones are solved.
     limited
-        Whether predictions are limited to the declared range of the instrument (`limited_to_range`).
+        Whether predictions are limited to the declared range of the instrument.
     slack
         Distance within the range, in the unit of the readings, from which noise may carry a reading to an end. For a
         reading at an end, a prediction within this distance counts as beyond the end.
@@ -288,29 +288,6 @@ def columns_without_reading(simulator: Simulator, table: RunTable) -> dict[str, 
     return {name: values for name, values in table.columns_as_given.items() if name != simulator.reading}
 
 
-def limited_to_range(predicted: FloatArray, system: System, table: RunTable) -> FloatArray:
-    """Limit predictions, (n_samples, n_points), to the declared range, as the instrument does.
-
-    Where a reading at an end was recorded, the limit is that reading, which may be rounded, and the prediction is moved
-    towards it by `system.slack`. Where the recorded reading is within the range, the prediction is not limited, so that
-    one beyond the range counts as a misfit.
-    """
-    noise = system.simulator.noise
-    if np.isinf(noise.ends).all():
-        return predicted
-    low, high = map(np.array, noise.ends)
-    recorded = table.columns.get(system.simulator.reading, np.array(""))
-    if recorded.dtype == np.float64:
-        at_low, at_high = masks_of_readings_at_ends(recorded, *noise.ends, noise.step)
-        slack = system.slack * (relative_sds_of_column(table, noise.sd) if isinstance(noise.sd, str) else 1.0)
-        predicted = predicted + slack * (1.0 * at_high - 1.0 * at_low)
-        within = (low < recorded) & (recorded < high) & ~(at_low | at_high)
-        low = np.where(within, -np.inf, np.where(at_low, recorded, low))
-        high = np.where(within, np.inf, np.where(at_high, recorded, high))
-    # A prediction that ran away stays as it is: not finite.
-    return np.where(np.isfinite(predicted), np.clip(predicted, low, high), predicted)
-
-
 @dataclass(frozen=True, eq=False)
 class SystemChain:
     """A system with effects, applied in this order: input and clock, parameters, law, reading."""
@@ -371,12 +348,30 @@ class SystemChain:
         return integrate_from_known_trajectories(law_and_inputs, steps, memory, effects=of, theta=theta, n_own=n_own)
 
     def readings_from_simulated_view(self, view: FloatArray, theta: FloatArray, plan: Any) -> FloatArray:
-        """Return a result of `simulated_view` with the effects on readings applied, (n_samples, n_points)."""
+        """Return a result of `simulated_view` with the effects on readings applied, (n_samples, n_points).
+
+        They are limited to the declared range, as by the instrument. Where a reading at an end was recorded, the limit
+        is that reading, which may be rounded, and the prediction is moved towards it by `System.slack`. Where the
+        recorded reading is within the range, it is not limited, so that one beyond the range counts as a misfit.
+        """
         with np.errstate(all="ignore"):  # of readings that ran away: not finite, as they were
             for effect, columns in self._effects_with_theta_columns:
                 if Stage.SEEN <= effect.stage <= Stage.SATURATION:
                     view = effect.apply(view, theta[:, columns], plan)
-        return limited_to_range(view, self.system, plan) if self.system.limited else view
+        noise = self.system.simulator.noise
+        if not self.system.limited or np.isinf(noise.ends).all():
+            return view
+        low, high = map(np.array, noise.ends)
+        recorded = plan.columns.get(self.system.simulator.reading, np.array(""))
+        if recorded.dtype == np.float64:
+            at_low, at_high = masks_of_readings_at_ends(recorded, *noise.ends, noise.step)
+            slack = self.system.slack * (relative_sds_of_column(plan, noise.sd) if isinstance(noise.sd, str) else 1.0)
+            view = view + slack * (1.0 * at_high - 1.0 * at_low)
+            within = (low < recorded) & (recorded < high) & ~(at_low | at_high)
+            low = np.where(within, -np.inf, np.where(at_low, recorded, low))
+            high = np.where(within, np.inf, np.where(at_high, recorded, high))
+        # A prediction that ran away stays as it is: not finite.
+        return np.where(np.isfinite(view), np.clip(view, low, high), view)
 
     def _apply_stage(self, stage: Stage, value: Any, theta: FloatArray, plan: Any) -> Any:
         for effect, columns in self._effects_with_theta_columns:

@@ -10,7 +10,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise._arrays import BoolArray, FloatArray
 from probewise.errors import ParameterError
 from probewise.recordings.patterns import Disc, HalfPlane, Image, Pattern, Polygon, Quadrant, Ramp, Stripes, Uniform
 from probewise.world.spots import Spot
@@ -233,7 +233,11 @@ def _seen_white_fraction_of_block(
         per_block = max(1, _BLOCK // n_rays)
         for start in range(0, mixed_at[0].size, per_block):
             at = pose, row, column = tuple(index[start : start + per_block] for index in mixed_at)
-            first_u, first_v = _sequence_offset_of_pixels(row, column)
+            golden = 0.6180339887498949  # shifts each pixel's sequence by 0 to 1 pixel, evenly along rows and columns
+            first_u, first_v = (
+                np.mod(row * golden + column * _STEP_V, 1.0),
+                np.mod(column * golden + row * _STEP_U, 1.0),
+            )
             ray_u = u[column][:, None] + spot.pixel_mm * np.mod(first_u[:, None] + np.arange(n_rays) * _STEP_U, 1.0)
             ray_v = v[row][:, None] + spot.pixel_mm * np.mod(first_v[:, None] + np.arange(n_rays) * _STEP_V, 1.0)
             c, s = cos[pose, 0], sin[pose, 0]
@@ -244,9 +248,3 @@ def _seen_white_fraction_of_block(
         mid_u, mid_v = u[:-1] + spot.pixel_mm / 2, (v[:-1] + spot.pixel_mm / 2)[:, None]
         albedo = retouch(albedo, x_mm + cos * mid_u - sin * mid_v, y_mm + sin * mid_u + cos * mid_v)
     return np.asarray(np.einsum("kvu,vu->k", albedo, spot.weights))
-
-
-def _sequence_offset_of_pixels(row: IntArray, column: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Return each pixel's shift (u, v) of the ray sequence, 0 to 1 pixel, spread evenly along rows and columns."""
-    golden = 0.6180339887498949
-    return np.mod(row * golden + column * _STEP_V, 1.0), np.mod(column * golden + row * _STEP_U, 1.0)

@@ -122,7 +122,11 @@ class World:
         The plan's columns `height_mm` and `led` are commands; NaN means `self.height_mm` and LED 1. The view does not
         depend on effects from the stage "response" on: worlds that differ in such effects only can share one view.
         """
-        found = self._surfaces_with_rows(plan, surfaces)
+        known: dict[str, Surface] = {**plan.patterns, **(surfaces or {})}
+        found = []
+        for name, rows in plan.rows_by_pattern():
+            require(name in known, "pattern", name, f"one of {', '.join(known) or 'none'}, or give it in surfaces")
+            found.append((known[name], rows))
         across, edge_mm = np.empty((len(plan), 2)), np.empty(len(plan))
         for surface, chosen in found:
             across[chosen] = common_edge_normal(surface)
@@ -228,13 +232,6 @@ class World:
             if effect.stage == stage:
                 values = effect.act(values, *more)
         return values
-
-    def _surfaces_with_rows(self, plan: Plan, surfaces: Mapping[str, Surface] | None) -> _Surfaces:
-        known: dict[str, Surface] = {**plan.patterns, **(surfaces or {})}
-        rows_by_pattern = plan.rows_by_pattern()
-        for name, _ in rows_by_pattern:
-            require(name in known, "pattern", name, f"one of {', '.join(known) or 'none'}, or give it in surfaces")
-        return [(known[name], rows) for name, rows in rows_by_pattern]
 
 
 class Reader:

@@ -89,7 +89,6 @@ _ABSORBED = 0.01  # of a trace; of what a null takes up all but so little no ref
 # beside another that it makes superfluous, and the right pair may be built from the part that looked worse.
 _ELIMINATED = 3
 _SWAPPED = 2  # combinations that lead beside what is left, with what was left out or another
-_REFITTED_AT_OTHER_ORDERS = 1e-4  # probability of such a combination, among those with a formula
 
 
 @dataclass(eq=False)
@@ -286,9 +285,6 @@ def competitors(names: Names, among: Iterable[WeighedFit]) -> list[WeighedFit]:
     return [c for c in among if effects_out_of_vocabulary(names) or not effects_out_of_vocabulary(c.names)]
 
 
-_MOST_EXACT = 0.25  # share of the readings, those of the smallest declared sds, in which rounding shows first
-
-
 def fit_nulls(state: SearchState, prepared: Prepared, *, max_order: int) -> None:
     """Fit the given null; if there is none, each form of the SSF: one Gaussian, the free form, more Gaussians.
 
@@ -348,7 +344,8 @@ def noise_sd_about_given_null(prepared: Prepared) -> float:
     with np.errstate(all="ignore"):  # of a start from which the model runs away
         residuals = np.abs(readings - model.predict(z[None, :])[0, rows])
     relative_sd = recording.relative_sd[rows]
-    median = float(np.median(residuals[relative_sd <= np.quantile(relative_sd, _MOST_EXACT)])) / MAD_OF_NORMAL
+    exact = relative_sd <= np.quantile(relative_sd, 0.25)  # in the most exact ones rounding shows first
+    median = float(np.median(residuals[exact])) / MAD_OF_NORMAL
     free = max(len(rows) - model.n_params, 1)
     # Readings that are all as predicted still have the sd of rounding.
     return max(median, sd_of_rounding(step)) * math.sqrt(len(rows) / free) if math.isfinite(median) else math.inf
@@ -380,8 +377,13 @@ def select_forward(state: SearchState, *, depth: int) -> None:
             if size == 1 and _is_outdone(state, null, proposal):
                 continue
             refitted.append(state.refit_with_effect(proposal.parent, proposal.added))
-        if size == 2:
-            refitted += _refit_leading_pairs(state)
+        if size == 2:  # and what leads about the null though neither effect alone does, as a difference of two columns
+            settled, best = state.refitted_combinations | state.undetected, _largest_scores_about_null(state)
+            pairs: dict[Names, float] = {k: value for k, value in best.items() if len(k) == 2 and k not in settled}
+            # All against what was best before: equal pairs are refitted, or none.
+            for names in promising_combinations(state, pairs, width=_BEAM, behind=ENOUGH_NATS):
+                state.refit_stepwise(names)
+            refitted += [c for names in pairs for c in state.candidates_of_combination(names)]
         state.share = 1.0
         kept = list({c.names: c for c in refitted if c is not None}.values())
         if not kept:
@@ -390,7 +392,11 @@ def select_forward(state: SearchState, *, depth: int) -> None:
 
 
 def _proposals_to_try(state: SearchState, null: WeighedFit, parents: Sequence[WeighedFit], size: int) -> list[Proposal]:
-    """Choose the combinations of `size` effects to refit, each as a candidate (parent) with one more effect."""
+    """Choose the combinations of `size` effects to refit, each as a candidate (parent) with one more effect.
+
+    Pairs of an effect that may occur twice are tried where it alone gains two nats in the simplest noise: while only
+    one of two waves is fitted, the other looks like noise with memory, which may hide both.
+    """
     proposals: dict[Names, Proposal] = {}
     for parent in parents:
         proposals = proposals_for(state, parent, proposals)
@@ -399,9 +405,15 @@ def _proposals_to_try(state: SearchState, null: WeighedFit, parents: Sequence[We
         return [*alone, *_proposals_under_simplest_noise(state, null)]
     best = _largest_scores_about_null(state) if size == 2 else {}
     scores = {names: max(own.score, best.get(names, own.score)) for names, own in proposals.items()}
-    chosen = promising_combinations(state, scores, width=_BEAM, behind=ENOUGH_NATS)
-    more = _pairs_of_repeatable_effects(state, null)
-    return [proposals[names] for names in dict.fromkeys([*chosen, *more]) if names in proposals]
+    chosen, plain = promising_combinations(state, scores, width=_BEAM, behind=ENOUGH_NATS), state.refits.noises.certain
+    least = null.evidence[plain].log_z + _REPEATED_FROM
+    twice = [
+        (first, name)
+        for name in state.effects
+        if (first := name_of_first_copy(name)) is not None
+        and any(c.evidence[plain].log_z > least for c in state.candidates_of_combination((first,)))
+    ]
+    return [proposals[names] for names in dict.fromkeys([*chosen, *twice]) if names in proposals]
 
 
 def _screen_pairs(state: SearchState, null: WeighedFit) -> None:
@@ -511,32 +523,6 @@ def _proposals_under_simplest_noise(state: SearchState, null: WeighedFit) -> lis
     return [Proposal(math.inf, plain, name) for name in ranked if odds[name] > 0]
 
 
-def _pairs_of_repeatable_effects(state: SearchState, null: WeighedFit) -> list[Names]:
-    """Return the pairs (effect, its copy) of effects that may occur twice and, alone, gain two nats in simplest noise.
-
-    While only one of two waves is fitted, the other looks like noise with memory, which may hide both.
-    """
-    plain = state.refits.noises.certain
-    least = null.evidence[plain].log_z + _REPEATED_FROM
-    return [
-        (first, name)
-        for name in state.effects
-        if (first := name_of_first_copy(name)) is not None
-        and any(c.evidence[plain].log_z > least for c in state.candidates_of_combination((first,)))
-    ]
-
-
-def _refit_leading_pairs(state: SearchState) -> list[WeighedFit]:
-    """Refit the pairs that lead about the null though neither effect alone does, as of a difference of two columns."""
-    settled = state.refitted_combinations | state.undetected
-    best = _largest_scores_about_null(state).items()
-    scores: dict[Names, float] = {names: value for names, value in best if len(names) == 2 and names not in settled}
-    # All against what was best before: equal pairs are refitted, or none.
-    for names in promising_combinations(state, scores, width=_BEAM, behind=ENOUGH_NATS):
-        state.refit_stepwise(names)
-    return [c for names in scores for c in state.candidates_of_combination(names)]
-
-
 def _largest_scores_about_null(state: SearchState) -> dict[Names, float]:
     best: dict[Names, float] = {}
     for (names, _), value in state.about_null.items():
@@ -580,36 +566,31 @@ def refit_at_other_orders(state: SearchState, by_mean: Mapping[Names, float]) ->
     for k, names in enumerate(leaders[:_FEW]):
         state.progress("refitting at other numbers of Gaussians", k, min(len(leaders), _FEW))
         source = state.best_candidate(names)
-        if source is None or by_mean[names] < _REFITTED_AT_OTHER_ORDERS * known:
+        if source is None or by_mean[names] < 1e-4 * known:
             continue
-        own = state.candidates[source.n_gaussians, ()].log_z
+        own, law, fitted = (
+            state.candidates[source.n_gaussians, ()].log_z,
+            state.refits.likeliest_law(source),
+            source.found,
+        )
         for null in state.nulls:
             # A freer SSF that the evidence rejects by itself is also rejected with an effect.
             ahead, more = null.log_z - own, null.ssf_degrees_of_freedom
             is_freer, is_much_freer = (more >= source.ssf_degrees_of_freedom + k for k in (0, 2))
             rejected = (is_freer and ahead <= -_REFITTED_WITHIN) or (is_much_freer and ahead <= 0)
-            if (null.n_gaussians, names) not in state.candidates and not rejected:
-                _refit_with_form_of(state, source, null)
-
-
-def _refit_with_form_of(state: SearchState, source: WeighedFit, null: WeighedFit) -> None:
-    """Refit a candidate's effects with the SSF's form of a null; store the fit if significantly better than that."""
-    sensor, found = null.found.model.sensor, source.found
-    start = np.concatenate([null.found.z, found.z[found.model.sensor.n_params :]])
-    candidate = state.refits.fit_and_weigh(
-        replace(found.model, sensor=sensor), start[None, :], state.refits.likeliest_law(source), max_steps=15
-    )
-    before, after = (state.complexity_penalty(fit.ssf_degrees_of_freedom) for fit in (source, null))
-    candidate = candidate.with_variant_factor_and_weights(source.log_share + before - after, source.weights)
-    if candidate.is_significantly_better(null):
-        state.store_candidate(candidate)
+            if (null.n_gaussians, names) in state.candidates or rejected:
+                continue
+            model = replace(fitted.model, sensor=null.found.model.sensor)
+            start = np.concatenate([null.found.z, fitted.z[fitted.model.sensor.n_params :]])
+            candidate = state.refits.fit_and_weigh(model, start[None, :], law, max_steps=15)
+            before, after = (state.complexity_penalty(fit.ssf_degrees_of_freedom) for fit in (source, null))
+            candidate = candidate.with_variant_factor_and_weights(source.log_share + before - after, source.weights)
+            if candidate.is_significantly_better(null):
+                state.store_candidate(candidate)
 
 
 MAX_ORDER = 3  # Gaussians of the SSF that are tried; one more where that is not far behind
 _FEW_READINGS = 40  # usable readings below which one Gaussian is tried, and no free form
-_NULL_TRIED_AGAIN = 2  # fits of one effect from which a given null is fitted once more
-_REFITTED_LATE = 0.02  # probability by screening alone, from which on a combination is refitted
-_WITH_UNKNOWN = 4  # refitted combinations that something unknown is weighed beside
 
 
 def prune_out_of_vocabulary(
@@ -780,7 +761,13 @@ def search(
     made again. Returns `Searched`: evidences and probabilities of all hypotheses, and the refits.
     """
     state, misfit_templates = _begin(prepared, prior, max_order, after, progress)
-    unknown, noises = _build_unknown_effects(state, misfit_templates), state.refits.noises
+    bases, noises = misfit_templates.unknown_bases, state.refits.noises
+    if formulas := [effect for name, effect in state.effects.items() if name.startswith(PROPOSAL)]:
+        # As a formula and as a basis a product of columns would be the same hypothesis twice, and the less specific
+        # one, the basis, might lead. The test of the residuals keeps all, since these readings chose the formulas.
+        problem = Linearised.of(state.null.found, state.refits.likeliest_law(state.null))
+        bases = without_products_like(bases, state.refits.templates.coarse_bank(state.null.found, formulas), problem)
+    unknown = UnknownEffects(state, bases, misfit_templates.covariates)
 
     def found() -> Searched:
         own = Evidences(state.candidates, state.screened_log_evidences(), unknown.log_z, unknown.shares)
@@ -799,7 +786,7 @@ def search(
     state.candidates, state.pruned = prune_out_of_vocabulary(state.candidates, noises)
     progress("comparing unknown effects")
     refitted = [c for c in state.candidates.values() if c.names]
-    unknown.weigh_beside(sorted(refitted, key=lambda c: -c.log_z)[:_WITH_UNKNOWN])
+    unknown.weigh_beside(sorted(refitted, key=lambda c: -c.log_z)[:4])
     unknown.drop_superfluous(state.candidates.values())
     out = found()
     if noises.sd_prior is None:
@@ -822,7 +809,7 @@ def _refit_favoured_by_screening(state: SearchState, posterior: Callable[[], Hyp
         by_mean = posterior().marginal_over_noise
         settled = {(), UNKNOWN} | state.undetected | state.refitted_combinations
         names = max((key for key in by_mean if key not in settled), key=lambda key: by_mean[key], default=())
-        if by_mean.get(names, 0.0) <= _REFITTED_LATE or not names:
+        if by_mean.get(names, 0.0) <= 0.02 or not names:
             return
         part = state.largest_refitted_part(names)
         if state.refits.given_null is not None and part.names and part not in screened:
@@ -839,25 +826,11 @@ def _refit_null_from_effects(state: SearchState) -> None:
     """Refit the null from the best fits with one effect, whose gain may be due to a better mode of the null."""
     null = state.null
     single = [c for c in state.candidates.values() if len(c.names) == 1 and c.log_z > null.log_z]
-    for candidate in sorted(single, key=lambda c: -c.log_z)[:_NULL_TRIED_AGAIN]:
+    for candidate in sorted(single, key=lambda c: -c.log_z)[:2]:
         start = candidate.found.z[: null.found.model.sensor.n_params]
         again = state.refits.fit_and_weigh(null.found.model, start[None, :], candidate.law)
         if again.log_z > state.null.log_z + SAME_MODE:
             state.store_candidate(again)
-
-
-def _build_unknown_effects(state: SearchState, misfit_templates: MisfitTemplates) -> UnknownEffects:
-    """Build the evidence of unknown effects, without the products of columns that are among the state's formulas.
-
-    As a formula and as a basis a product would be the same hypothesis twice, and the less specific one, the basis,
-    might lead. The test of the residuals keeps all bases, since the formulas were chosen by these readings.
-    """
-    null, bases = state.null, misfit_templates.unknown_bases
-    formulas = [effect for name, effect in state.effects.items() if name.startswith(PROPOSAL)]
-    if formulas:
-        problem = Linearised.of(null.found, state.refits.likeliest_law(null))
-        bases = without_products_like(bases, state.refits.templates.coarse_bank(null.found, formulas), problem)
-    return UnknownEffects(state, bases, misfit_templates.covariates)
 
 
 def _build_misfit_templates(state: SearchState, prepared: Prepared) -> MisfitTemplates:
@@ -874,22 +847,22 @@ def _build_misfit_templates(state: SearchState, prepared: Prepared) -> MisfitTem
     return MisfitTemplates(null.found, unlike, tuple(covariates))
 
 
-_LEFT_FROM = 0.1  # probability that more is left than noise without a memory, from which formulas are proposed
 # Nats behind the best of what was refitted, within which screening must see a formula: alone, where an effect of
 # hundreds of nats is seen wrongly by a dozen, and beside the best single effect or the leader, whose fits are near.
-_WITHIN_ALONE = 12.0
-_WITHIN_BESIDE = 3.0
+_WITHIN_ALONE, _WITHIN_BESIDE = 12.0, 3.0
 
 
 def search_with_formulas(searched: Searched, *, progress: Progress = silent) -> Searched:
     """Return a second search that includes the formulas favoured by screening; the given one if there are none.
 
-    The given search is also returned if noise without memory explains the readings, or the budget of refits is spent.
-    Named effects can partly explain what one formula explains, and then predict other runs badly: a square law an
-    exponential leak, a step and a sensitivity together a product. Noise with memory absorbs slow changes.
+    The given search is also returned if noise without memory explains the readings, to a probability of .9, or the
+    budget of refits is spent. Named effects can partly explain what one formula explains, and then predict other runs
+    badly: a square law an exponential leak, a step and a sensitivity together a product. Noise with memory absorbs slow
+    changes.
     """
     prepared, apparatus = searched.prepared, searched.prepared.apparatus
-    if not needs_more_than_memoryless_noise(searched) or prepared.is_refit_budget_spent():
+    plain = (p for (mean, noise), p in searched.posterior.probabilities.items() if not (mean or WITH_MEMORY & {*noise}))
+    if not 1.0 - sum(plain) > 0.1 or prepared.is_refit_budget_spent():
         return searched
     proposals = apparatus.proposed_formulas()
     if prepared.sought is not None:
@@ -910,12 +883,6 @@ def search_with_formulas(searched: Searched, *, progress: Progress = silent) -> 
     more = replace(prepared, effects={**prepared.effects, **kept})
     again = search(more, prior=prior, after=searched, progress=progress)
     return searched if prepared.is_refit_budget_spent() else again
-
-
-def needs_more_than_memoryless_noise(searched: Searched) -> bool:
-    """Return whether effects on the mean, or noise with memory, together have a probability above 0.1."""
-    plain = (p for (mean, noise), p in searched.posterior.probabilities.items() if not (mean or WITH_MEMORY & {*noise}))
-    return 1.0 - sum(plain) > _LEFT_FROM
 
 
 def _promise_by_formula(searched: Searched, proposals: Mapping[str, Effect]) -> dict[str, float]:

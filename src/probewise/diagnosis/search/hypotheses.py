@@ -55,12 +55,7 @@ SAME_MODE = 0.02  # nats by which another fit of the null must be better to be a
 # Nats behind the best refit: a fit so far behind is weighed once, and one of a law that stays there is given up. Where
 # an effect gains hundreds of nats, others gain some of them slowly, and most steps of a search were theirs.
 FAR_BEHIND = 40.0
-_FEW_VARIANTS = 3  # of an effect, which are all refitted: screening is no judge of a bound
-_VARIANTS_TRIED = 0.05  # of the leading variant's weight: the next, of an effect bound to scans, is refitted too
-_MOST_FAULTS = 3  # of the noise at once
 _MANY = 12  # nodes of one effect above which they are thinned before combination with another's
-# Nats behind the best to which refined nodes must be able to raise a noise model: further back it does not count.
-_NOISE_NODES_REFINED_WITHIN = 10.0
 
 EffectNames: TypeAlias = tuple[Names, Names]
 """Names of the effects on the mean, and on the noise."""
@@ -197,9 +192,6 @@ def _changed(noise: Names) -> Names:
 WITH_MEMORY = frozenset({correlated_noise.name, random_walk.name})
 """Effects on the noise of which a noise distribution can contain only one."""
 
-Nodes: TypeAlias = Mapping[str, tuple[FloatArray, FloatArray]]
-"""Nodes of effects on the noise, by name, (n_nodes, n_params), and their log prior weights."""
-
 
 @dataclass(eq=False)
 class NoiseModels:
@@ -240,7 +232,9 @@ class NoiseModels:
         single = [tuple(sorted({*names, *self.certain})) for names in ((), *((name,) for name in others))]
         self.models = {names: self._build_model(names) for names in single}
 
-    def _build_model(self, names: Names, likely: Nodes | None = None) -> NoiseModel:
+    def _build_model(
+        self, names: Names, likely: Mapping[str, tuple[FloatArray, FloatArray]] | None = None
+    ) -> NoiseModel:
         # Certain effects are not re-estimated about each fit, whose own residual may be larger.
         effects = tuple(self.effects[n] for n in names)
         rounding = self._rounding if names == self.certain else 0.0
@@ -259,12 +253,11 @@ class NoiseModels:
         return float(logsumexp(values)) if values else -math.inf
 
     def evidence_by_noise(self, found: Fit) -> dict[Names, NoiseEvidence]:
-        """Compute the evidence of a fit by noise model; of those that may lead, with nodes about their peak."""
+        """Compute the evidence of a fit by noise model; with nodes about its peak if these may bring it to ten nats."""
         evidence = {names: laplace_evidence(found, model) for names, model in self.models.items()}
         best = max((e.log_z + self.log_prior(names) for names, e in evidence.items()), default=-math.inf)
         return {
-            names: refined(found, own, least=best - self.log_prior(names) - _NOISE_NODES_REFINED_WITHIN)
-            for names, own in evidence.items()
+            names: refined(found, own, least=best - self.log_prior(names) - 10.0) for names, own in evidence.items()
         }
 
     def likeliest_law(self, evidence: Mapping[Names, NoiseEvidence]) -> NoiseLaw:
@@ -277,7 +270,7 @@ class NoiseModels:
         Only those within three nats of the best are added. Returns whether any pair was tried.
         """
         known, singles = dict(evidence), list(evidence)
-        for size in range(1, _MOST_FAULTS):
+        for size in (1, 2):  # at most three faults of the noise at once
             of_size = {names: e for names, e in known.items() if len(self._uncertain_names(names)) == size}
             first = max(of_size, key=lambda names: of_size[names].log_z, default=self.certain)
             parts = [n for n in known if set(n) < set(first)]
@@ -346,8 +339,6 @@ def require_converged_fit(found: Fit, problem: Linearised) -> None:
 
 Extended: TypeAlias = tuple[WeighedFit, dict[Names, float]]
 """A candidate with one more effect, and the closed-form scores of the effect by noise model."""
-
-_SAME_START = 0.1  # in prior sds: starts that are closer together are duplicates
 
 
 @dataclass(frozen=True, eq=False)
@@ -430,17 +421,8 @@ class Refits:
         Returns the fit of the best variant, with the evidence averaged over all variants and reduced by `against` nats;
         and the effect's log Bayes factor by screening, by noise model.
         """
-        if (before := self.earlier_refit(parent, effect, against)) is None:
-            before = self._refit_with_likely_variants(parent, effect, against)
-            self.known[parent.n_gaussians, parent.names, effect, against] = parent, before
-        return before
-
-    def earlier_refit(self, parent: WeighedFit, effect: Effect, against: float = 0.0) -> Extended | None:
-        """Return a refit made before, also that of a fit as good to three nats; None if there is none."""
-        before = self.known.get((parent.n_gaussians, parent.names, effect, against))
-        return None if before is None or parent.log_z > before[0].log_z + ENOUGH_NATS else before[1]
-
-    def _refit_with_likely_variants(self, parent: WeighedFit, effect: Effect, against: float) -> Extended:
+        if (before := self.earlier_refit(parent, effect, against)) is not None:
+            return before
         templates = self.templates.templates_of(parent.found, effect)
         bank, odds = TemplateBank.of(templates.columns, [effect.name] * len(templates.columns)), templates.variant_odds
 
@@ -452,8 +434,7 @@ class Refits:
         by_noise = {noise: log_mean_exp(screened(e.likeliest_law)[1]) for noise, e in parent.leading_noises()}
         own_law = self.likeliest_law(parent)
         seen = [screened(own_law)]
-        # Under heavy-tailed noise, a few readings changed by an effect count as outliers; so start from white noise
-        # too.
+        # Under heavy-tailed noise, a few readings changed by an effect count as outliers: start from white noise too.
         law = parent.evidence[self.noises.certain].likeliest_law
         if not law.is_practically_equal(seen[0][0].law):
             seen.append(screened(law))
@@ -469,8 +450,7 @@ class Refits:
             weights[tried] = odds[tried] * np.exp(log_z - log_z[best])
             weights /= weights.sum()
         of_best = math.log(weights[tried[best]]) - math.log(odds[tried[best]])
-        log_share = parent.log_share - of_best - math.log(odds.sum()) - against
-        log_share += math.log(effect.n_peaks)
+        log_share = parent.log_share - of_best - math.log(odds.sum()) - against + math.log(effect.n_peaks)
         # Noise with memory imitates a missing effect: what it leaves of the parent may be white about the refit, where
         # a change point is far better known. To first order: only where that leads to the variant of the best refit.
         law = self.likeliest_law(refitted[best])
@@ -479,7 +459,13 @@ class Refits:
             probabilities = templates.variant_probabilities(screened(law)[1] if later is None else later)
             weights = probabilities if int(np.argmax(probabilities)) == tried[best] else weights
         extended = refitted[best].with_variant_factor_and_weights(log_share, {**parent.weights, effect.name: weights})
+        self.known[parent.n_gaussians, parent.names, effect, against] = parent, (extended, by_noise)
         return extended, by_noise
+
+    def earlier_refit(self, parent: WeighedFit, effect: Effect, against: float = 0.0) -> Extended | None:
+        """Return a refit made before, also that of a fit as good to three nats; None if there is none."""
+        before = self.known.get((parent.n_gaussians, parent.names, effect, against))
+        return None if before is None or parent.log_z > before[0].log_z + ENOUGH_NATS else before[1]
 
     def _refit_variant(
         self,
@@ -499,12 +485,11 @@ class Refits:
                 columns = templates.columns[at]
                 amount = _amplitudes_in_residual(about.project(columns), about.residual)
                 setting = effect.start(templates.settings[at], amount)
-                # An effect without amplitude is present as a whole; to first order, its fitted fraction may differ from
-                # one.
+                # To first order, an effect without amplitude, present as a whole, may be fitted by another fraction.
                 for taken in (amount,) if effect.amplitudes else (amount, np.ones_like(amount)):
                     z = parent.found.z + about.absorbing_shift(parent.found, columns @ taken)
                     start = np.concatenate([z, model.z_of_last_effect(setting[None, :])[0]])
-                    if all(np.abs(start - other).max() > _SAME_START for other in starts):
+                    if all(np.abs(start - other).max() > 0.1 for other in starts):  # prior sds: else a duplicate
                         starts.append(start)
         if self.given_null is not None and len(self.given_null.starts) > 1:
             # With several modes of the null, the best one may change with the effect.
@@ -546,15 +531,14 @@ def _variant_to_show(log_z: FloatArray, variants: Sequence[Effect]) -> int:
 def _variants_to_refit(templates: EffectTemplates, weights: FloatArray) -> list[int]:
     """List the variants to refit, by number: all of two; else the best and, if bound to scans and likely, the next."""
     ranked: list[int] = np.argsort(-weights).tolist()
-    if len(weights) <= _FEW_VARIANTS:
+    if len(weights) <= 3:  # screening is no judge of a bound
         return ranked
     # Two scans of opposite direction are aliased to first order; a refit shows which one was turned.
     first, second = ranked[:2]
     bound = templates.variants[first].scans or templates.variants[first].patterns
-    return [first, second] if bound and weights[second] > _VARIANTS_TRIED * weights[first] else [first]
+    return [first, second] if bound and weights[second] > 0.05 * weights[first] else [first]
 
 
-_BEYOND_DOUBT = math.log(1000)  # log odds of outlying readings against noise without them
 _TIE = 0.01  # nats between hypotheses that are one: a fit stops when a step gains less than half of it
 
 
@@ -613,9 +597,9 @@ class Evidences:
     def only_outlying_readings_differ(self, prior: PriorOdds, certain: Names) -> bool:
         """Return whether effects on the mean that beat outlying readings change no other readings than those.
 
-        Outlying readings are beyond doubt then without an effect. Jumps before the last reading, or delays past the
-        first, are many ways to say the same of fewer than five rows; the others differ by less than the three nats that
-        tell aliases apart.
+        Outlying readings are beyond doubt then without an effect, at odds of 1000. Jumps before the last reading, or
+        delays past the first, are many ways to say the same of fewer than five rows; the others differ by less than the
+        three nats that tell aliases apart.
         """
         noise = tuple(sorted({outliers.name, *certain}))
         nulls = [fit for (_, names), fit in self.fits.items() if not names and {noise, certain} <= fit.evidence.keys()]
@@ -626,7 +610,7 @@ class Evidences:
         least, law = evidence.log_z, evidence.likeliest_law
         odds = prior.log_prior_on_noise((outliers.name,)) - prior.log_prior_on_noise(())
         rivals = [fit for (_, names), fit in self.fits.items() if names and fit.log_z > least]
-        if not rivals or not least - max(fit.at_likelier_sd(certain).log_z for fit in nulls) + odds > _BEYOND_DOUBT:
+        if not rivals or not least - max(fit.at_likelier_sd(certain).log_z for fit in nulls) + odds > math.log(1000):
             return False
         narrow = 1 - outlier_probabilities(null.found.residuals, law)
         sd = law.likeliest_sigma_of(null.found.residuals)
@@ -720,13 +704,10 @@ def hypothesis_probabilities(evidences: Evidences, prior: PriorOdds, *, certain:
     for key in sorted(log_p, key=lambda key: -log_p[key]):
         level = level if level - log_p[key] < _TIE else log_p[key]
         log_p[key] = level
-    log_p = dict(sorted(log_p.items(), key=lambda item: (-item[1], *map(_plainness, item[0]))))
+    plainness = {names: (len(names), sum(name.count(":") for name in names), names) for key in log_p for names in key}
+    log_p = dict(sorted(log_p.items(), key=lambda item: (-item[1], *(plainness[names] for names in item[0]))))
     total = float(logsumexp(list(log_p.values())))
     return HypothesisProbabilities({key: math.exp(value - total) for key, value in log_p.items()})
-
-
-def _plainness(names: Names) -> tuple[int, int, Names]:
-    return len(names), sum(name.count(":") for name in names), names
 
 
 @dataclass(frozen=True, eq=False)

@@ -47,6 +47,14 @@ READ = {
         "a column without a name, ignored",
     ),
     "a name on two lines": (table("{t},{y},5", '"t_s","temp_c","room\n(°C)"\n'), ""),
+    "a summary below names": (
+        table("ann,{t},{y}", "who,t_s,temp_c\n") + "Average,4.5,275.8\nTotal,18,1103.1\n",
+        "2 rows without readings left out (first: row 6)",
+    ),
+    "a column of numbers but for a word": (
+        table("{t},{y},{t}", "t_s,temp_c,room\n").replace(",6\n", ",OL\n"),
+        "column room is taken as text: row 4 holds 'OL'",
+    ),
     "a summary below": (PLAIN + "mean,275.8\n\nend of file\n", "2 rows without readings left out (first: row 6)"),
     "empty rows below": (PLAIN + ",\n,\n", ""),
     "a comment between rows": (rows(PLAIN, "# door opened, and shut, twice\n3"), "1 row without readings"),

@@ -51,6 +51,7 @@ _DECLARED = re.compile(r'"?sep=(.)"?\r?\n')  # a spreadsheet's own line
 _MAY_LACK = frozenset({"", "Comment", "comment"})  # the last column of LabVIEW's files, empty in most rows
 _X_VALUE = "X_Value"  # LabVIEW's column of times, in seconds, where X_Dimension is Time
 _SUMMARY = re.compile(r"(mean|average|avg|median|total|sum|min|max|minimum|maximum|sd|std|stdev|count|end)\b", re.I)
+_NO_NAME = re.compile(r"(grand |sub)?(mean|average|avg|median|total|totals|sum):?", re.I)  # of a row among names
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,10 +178,12 @@ class _Layout:
     def is_comment(self, row: Sequence[str]) -> bool:
         return 0 in self.numeric and row[0].lstrip().startswith("#")
 
-    def is_below_table(self, row: Sequence[str]) -> bool:
-        """Return whether a row after all others is no reading, but a text or a summary."""
+    def is_below_table(self, row: Sequence[str], before: Sequence[Sequence[str]]) -> bool:
+        """Return whether a row after all others, those `before`, is no reading, but a text or a summary."""
         first = next(cell.strip() for cell in row if cell.strip())
-        if 0 not in self.numeric or _is_value(first):
+        if 0 not in self.numeric:  # but names
+            return _NO_NAME.fullmatch(first) is not None and all(other[0].strip() != first for other in before)
+        if _is_value(first):
             return False
         return len(row) not in (len(self.header), self.width) or _SUMMARY.match(first) is not None
 
@@ -277,7 +280,7 @@ def read_table(
                 progress(f"reading {path.name}", len(rows), max(n_below, len(rows)))
     except csv.Error as error:
         failed = error
-    while failed is None and records and layout.is_below_table(records[-1]):
+    while failed is None and records and layout.is_below_table(records[-1], records[:-1]):
         left_out.append(rows.pop())
         records.pop()
     for k, cells in enumerate(records):
@@ -287,7 +290,8 @@ def read_table(
                 raise layout.error_of_row(path, cells, rows[k])
     if failed is not None:
         found = f"not readable as CSV ({failed})"
-        raise FileError(path, found, "comma-separated cells, quotes closed", row=number + 1) from failed
+        cure = f"cells of up to {csv.field_size_limit():,} characters, quotes closed"
+        raise FileError(path, found, cure, row=number + 1) from failed
     progress(f"reading {path.name}", len(rows), len(rows))
     if not header:
         raise FileError(path, "the file is empty", "a header row and one row per reading")

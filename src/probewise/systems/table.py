@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import itertools
 import os
@@ -31,7 +30,13 @@ from probewise._arrays import (
 from probewise._kinds import checked_path, require_kind, require_text
 from probewise.errors import FileError, ParameterError, ShapeError, require
 from probewise.recordings import Instrumentation, Recording
-from probewise.recordings.cells import first_cell_without_number, parsed_numbers, times_to_numbers
+from probewise.recordings.cells import (
+    count_numbers,
+    first_cell_without_number,
+    is_missing,
+    parsed_numbers,
+    times_to_numbers,
+)
 from probewise.recordings.columns import notes_on_numbers_as_names, text_of_name
 from probewise.recordings.plan import masks_of_readings_at_ends
 from probewise.recordings.table import csv_text, number_text, read_table
@@ -384,10 +389,15 @@ def read_run_table(
     columns: dict[str, NDArray[Any]] = {name: np.array(cells) for name, cells in table.columns.items()}
     if time is not None and time != run:
         columns[time] = table.column_of_numbers(time)
-    for name in columns.keys() - {time, run}:
-        with contextlib.suppress(FileError):
+    notes = list(table.notes)
+    for name in [name for name in columns if name not in (time, run)]:
+        try:
             columns[name] = table.column_of_numbers(name, missing=True, largest=None)
-    return RunTable(columns, time, run, time_unit=time_unit, notes=table.notes, first_line=table.rows[0])
+        except FileError as error:
+            filled = [cell for cell in table.columns[name] if not is_missing(cell)]
+            if 2 * count_numbers(filled) > len(filled):
+                notes.append(f"{path.name}: column {name} is taken as text: row {error.row} holds {error.found}")
+    return RunTable(columns, time, run, time_unit=time_unit, notes=tuple(notes), first_line=table.rows[0])
 
 
 def run_table_csv(table: RunTable) -> str:

@@ -2,6 +2,7 @@
 
 import csv
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -100,11 +101,19 @@ def test_a_process_that_dies_is_said_in_words():
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGKILL")
-def test_the_processes_of_a_killed_command_end_with_it():
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
+def test_the_processes_of_a_killed_command_end_with_it_and_leave_no_file(number, tmp_path):
     """They hold its standard output, which would stay open."""
-    use = "import os\nfrom probewise.cli._executor import worker_pool\nwith worker_pool(2) as pool:\n"
-    killed = f"{use}    pool.submit(os.getpid).result()\n    os.kill(os.getpid(), 9)"
-    assert subprocess.run([sys.executable, "-c", killed], stdout=subprocess.PIPE, timeout=60).returncode == -9
+    use = "import os, tempfile\nfrom probewise.cli._executor import worker_pool\nwith worker_pool(2) as pool:\n"
+    killed = f"{use}    pool.submit(tempfile.mkdtemp).result()\n    os.kill(os.getpid(), {number:d})"
+    ended = subprocess.run(
+        [sys.executable, "-c", killed],
+        env={**os.environ, "TMPDIR": str(tmp_path)},
+        capture_output=True,
+        timeout=60,
+    )
+    assert ended.returncode == -number
+    assert not any(tmp_path.iterdir())
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no pipes with names")

@@ -6,7 +6,9 @@ import argparse
 import contextlib
 import multiprocessing
 import os
+import shutil
 import signal
+import tempfile
 import threading
 import warnings
 from collections.abc import Callable, Iterator
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
     from probewise.proof.pages import CampaignPage
 
 K = TypeVar("K")
+_END_S = 2.0  # longest wait for the end of a worker process
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -89,7 +92,8 @@ def _cluster_executor(address: str) -> Iterator[Executor]:
 def worker_pool(n: int) -> Iterator[ProcessPoolExecutor]:
     """Yield a pool of `n` processes with one thread of linear algebra each; if the block raises, end the processes.
 
-    They are spawned, not forked, for the same behaviour on every system. NotConvergedError if one dies.
+    They are spawned, not forked, for the same behaviour on every system. Their temporary files lie in one folder, which
+    ends with the pool, also if they or this process are killed. NotConvergedError if one dies.
     """
     for name in THREAD_VARIABLES:
         os.environ.setdefault(name, "1")
@@ -98,29 +102,36 @@ def worker_pool(n: int) -> Iterator[ProcessPoolExecutor]:
         before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
         resource_tracker.ensure_running()
         signal.signal(signal.SIGHUP, before)
-    pool = ProcessPoolExecutor(n, mp_context=multiprocessing.get_context("spawn"), initializer=_initialise_worker)
-    try:
-        yield pool
-    except BaseException as error:
-        pool.shutdown(wait=False, cancel_futures=True)
-        for child in multiprocessing.active_children():
-            child.terminate()
-        if isinstance(error, BrokenExecutor):
-            why = f"a worker process has died, by a signal or for want of memory ({error})"
-            raise NotConvergedError(why) from error
-        raise
-    pool.shutdown()
+    with tempfile.TemporaryDirectory(prefix="probewise-", ignore_cleanup_errors=True) as folder:
+        context = multiprocessing.get_context("spawn")
+        pool = ProcessPoolExecutor(n, mp_context=context, initializer=_initialise_worker, initargs=(folder,))
+        try:
+            yield pool
+        except BaseException as error:
+            pool.shutdown(wait=False, cancel_futures=True)
+            children = multiprocessing.active_children()
+            for child in children:
+                child.terminate()
+            for child in children:
+                child.join(_END_S)
+            if isinstance(error, BrokenExecutor):
+                why = f"a worker process has died, by a signal or for want of memory ({error})"
+                raise NotConvergedError(why) from error
+            raise
+        pool.shutdown()
 
 
-def _initialise_worker() -> None:
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+def _initialise_worker(folder: str) -> None:
+    tempfile.tempdir = folder
+    threading.Thread(target=_end_with_parent, args=(folder,), daemon=True).start()
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # end at once on Ctrl-C; the command reports what was kept
     warnings.simplefilter("ignore", DoubtfulResultWarning)  # the results hold the warnings, and the report shows them
 
 
-def _end_with_parent() -> None:
+def _end_with_parent(folder: str) -> None:
     """End this process once its parent is gone, though killed: a pool's processes would wait for tasks for ever."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()
+    shutil.rmtree(folder, ignore_errors=True)
     os._exit(1)

@@ -11,7 +11,7 @@ from exploring import run
 from probewise.arm import read_geometry, shipped_geometry_path
 from probewise.arm.instrument import Pose, Reading
 from probewise.effects import EFFECTS, Known, Origin
-from probewise.errors import FileError, LinkError, ParameterError
+from probewise.errors import DoubtfulResultWarning, FileError, LinkError, ParameterError
 from probewise.experiment import HiddenShape, JournalWriter, geometry_entry, read_journal, recording_of
 from probewise.experiment.journal import PosteriorSummary, require_same_settings, value_digest
 from probewise.recordings.patterns import Disc
@@ -242,6 +242,25 @@ def test_a_journal_that_names_the_geometry_is_not_resumed_with_another_and_an_ol
     for other in (there, {}):
         with pytest.raises(FileError, match="a run with other settings: another geometry of the arm;"):
             require_same_settings(new, {**SETTINGS, **other})
+
+
+def test_a_line_that_was_changed_or_is_of_another_run_is_doubted(small, tmp_path):
+    def go_on(name, *lines, n=6):
+        if lines:
+            (tmp_path / name).write_text("\n".join([*lines, ""]))
+        rng = np.random.default_rng(5)
+        return run(small.arm(), small.experiment(), rng=rng, journal=tmp_path / name, max_readings=n)
+
+    go_on("j", n=5)
+    first, *lines = (tmp_path / "j").read_text().splitlines()
+    assert not go_on("whole", first, *lines).notes
+    third = json.loads(lines[2])
+    value = {**third, "reading": third["reading"] + 45.0}
+    place = {**third, "pose": {**third["pose"], "x_mm": third["pose"]["x_mm"] + 99.0}}
+    for name, changed, said in (("value", value, "bits and not"), ("place", place, "is 99 mm")):
+        with pytest.warns(DoubtfulResultWarning, match=f"line 4 of .*{name} was changed, or an earlier one: .*{said}"):
+            notes = go_on(name, first, *lines[:2], json.dumps(changed), *lines[3:]).notes
+        assert any("line 4" in note for note in notes)
 
 
 def test_a_reading_that_the_sensor_cannot_return_is_not_written(small, tmp_path):

@@ -71,5 +71,6 @@ beliefs = [left_out_after_step(step, 0.9).probability for step in doubting.steps
 plots.effect_probabilities_by_reading(beliefs)
 
 # %%
-# The same in a sentence, with the size of the effect.
+# The same in a sentence, with the size of the effect. What looks alike, as a fading print and a sloping table, stays
+# open.
 left_out_after_step(doubting.last, 0.9).sentence

@@ -13,7 +13,9 @@ from multiprocessing import get_context
 from pathlib import Path
 
 from probewise.proof.campaign import read_campaign
-from probewise.proof.challenge import challenge
+from probewise.proof.challenge import challenge, run_case, run_system_case
+
+_WORK = {"": run_case, "systems": run_system_case}
 
 
 def main() -> None:
@@ -24,12 +26,16 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
-    keys = [key for key, result in read_campaign(options.cases).results.items() if result.get("kind") in options.kind]
+    earlier = read_campaign(options.cases)
+    of = str(earlier.settings.get("of", ""))
+    if of not in _WORK:
+        parser.error(f"{options.cases} is a campaign of {of}, not of light sensors or systems")
+    keys = [key for key, result in earlier.results.items() if result.get("kind") in options.kind]
     if not keys:
         parser.error(f"{options.cases} holds no case of kind {', '.join(options.kind)}")
     seeds, numbers = zip(*(map(int, key.split(" / ")) for key in keys), strict=True)
     with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
-        challenge(numbers, seed=seeds[0]).run(path=options.out, executor=pool)
+        challenge(numbers, seed=seeds[0], work=_WORK[of], of=of).run(path=options.out, executor=pool)
 
 
 if __name__ == "__main__":

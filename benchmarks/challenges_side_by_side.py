@@ -73,7 +73,10 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     arguments = parser.parse_args()
     read = read_campaign(arguments.earlier), read_campaign(arguments.later)
-    both, table = [each.results for each in read], score_systems if read[1].settings.get("of") == "systems" else score
+    of, other = (each.settings.get("of") for each in read)
+    if of != other:
+        parser.error(f"{arguments.earlier} is a campaign of {of or 'light sensors'}, {arguments.later} is not")
+    both, table = [each.results for each in read], score_systems if of == "systems" else score
     keys = [key for key in both[1] if key in both[0] and not any("failed" in results[key] for results in both)]
     earlier, later = ([results[key] for key in keys] for results in both)
     n_verdicts = sum(a["verdict"] == b["verdict"] for a, b in zip(earlier, later, strict=True))

@@ -185,6 +185,7 @@ MISTAKES = {
         "what light returned is None; allowed: a number",
     ),
     # instruments of one's own
+    "a size alone": (lambda: explore(SENSOR, conceal=3), "conceal is 3; allowed: effects as a text"),
     "an arm that cannot measure": (lambda: explore(SENSOR, arm=Bell()), r"object with measure\(pose"),
     "a Calibration to explore": (lambda: explore(CALIBRATION), "take its .sensor, this is the OfOne"),
     "a truth by wrong names": (

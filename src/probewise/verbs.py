@@ -289,6 +289,8 @@ def explore(
     _kinds.require_kind("field", field, Field, "a Field: Field(width_mm, height_mm)")
     require_fitted_sensor(sensor, "in the order explore(sensor, ...)")
     _kinds.require_flag("learn_sensor", learn_sensor)
+    if conceal is not None:
+        _kinds.require_text("conceal", conceal, 'effects as a text, such as "backlash:8", or None')
     for name, value, known in (("method", method, experiment.MethodName), ("model", model, experiment.ModelName)):
         _kinds.require_one_of(name, value, get_args(known))
     _kinds.require_kind("cards", cards, (tuple, list), "cards, of probewise.scene, in a list")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -143,7 +144,8 @@ def information_gained(bits: Mapping[str, FloatArray], *, about: str = "the shap
         label = f"{name}: {per_reading:.2f} bits per reading"
         ax.plot(np.arange(len(gained) + 1), np.r_[0.0, gained], label=label, **_dots_and_line(k))
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    return canvas.finish(ax, x="number of readings", y=f"information about {about} (bits)", plain=None)
+    label = "\n".join(textwrap.wrap(f"information about {about} (bits)", 34))  # no longer than the axes are high
+    return canvas.finish(ax, x="number of readings", y=label, plain=None)
 
 
 def _dots_and_line(k: int) -> dict[str, Any]:

@@ -147,6 +147,10 @@ def test_runs_named_by_numbers_are_joined_with_runs_named_by_texts():
 def test_rows_of_a_data_frame_are_called_as_its_index_shows_them():
     pandas = pytest.importorskip("pandas")
     frame = pandas.DataFrame({"t_s": [0.0, 1.0, 0.5]}, index=["mon", "tue", "wed"])
+    with pytest.raises(ParameterError, match=r"order of column 'y' is .*: make them one data frame"):
+        RunTable({"t_s": frame["t_s"], "y": frame["t_s"].iloc[::-1]})
+    missing = RunTable({"y": pandas.Series([pandas.NA, 2.0], dtype=object)}).columns["y"]
+    np.testing.assert_array_equal(missing, [np.nan, 2.0])
     with pytest.raises(ParameterError, match=r"in row wed is 0.5"):
         RunTable(frame, "t_s").require_rising_time()
     with pytest.raises(ParameterError, match=r"t in row 8 is 'noon'"):

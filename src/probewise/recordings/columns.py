@@ -67,7 +67,20 @@ def columns_by_name(table: TableLike) -> dict[str, Any]:
         own = str(name).strip()
         require(own not in columns, "columns", own, "each name once, also without the blanks around it")
         columns[own] = table[name]
+    require_one_order(columns)
     return columns
+
+
+def require_one_order(columns: Mapping[str, Any]) -> None:
+    """Raise ParameterError if columns of a data frame have the same labels of rows in another order than the first."""
+    indices: dict[str, Any] = {name: getattr(each, "index", None) for name, each in columns.items()}
+    labels = {name: index for name, index in indices.items() if hasattr(index, "equals")}
+    first = next(iter(labels.values()), ())
+    for name, index in labels.items():
+        differs = not index.equals(first) and set(index) == set(first)
+        require(
+            not differs, f"order of column {name!r}", list(index[:3]), "that of the others: make them one data frame"
+        )
 
 
 def numbers_per_reading(name: str, values: ArrayLike, n_points: int | None = None) -> FloatArray:
@@ -101,9 +114,9 @@ def texts_to_numbers(values: ArrayLike) -> ArrayLike:
 
 def _number_or_nan(cell: Any) -> Any:
     if not isinstance(cell, str):
-        if not (_is_missing(cell) or hasattr(cell, "__float__") or hasattr(cell, "__index__")):
+        if not (is_missing_value(cell) or hasattr(cell, "__float__") or hasattr(cell, "__index__")):
             raise ValueError("no number")
-        return math.nan if _is_missing(cell) else cell
+        return math.nan if is_missing_value(cell) else cell
     text = cell.strip()
     if text not in MISSING and not count_numbers([text]):  # float() would accept 'infinity' and '1_000' too
         raise ValueError("no number")
@@ -232,7 +245,9 @@ def _names_per_reading(name: str, values: Iterable[object], n_points: int) -> li
     if len(cells) != n_points:
         raise ShapeError(f"{name} has {len(cells)} names; allowed: {n_points}, one per reading, or a single text")
     for k, cell in enumerate(cells):
-        require(not _is_missing(cell), f"{name}[{k}]", cell, f"a name in every row; leave out rows without a {name}")
+        require(
+            not is_missing_value(cell), f"{name}[{k}]", cell, f"a name in every row; leave out rows without a {name}"
+        )
     texts, own = list(map(text_of_name, cells)), dict[str, str]()
     for k, text in enumerate(texts):
         if text not in own:
@@ -244,7 +259,7 @@ def text_of_name(value: object) -> str:
     """Return the name of a run, scan or pattern as text: numbers in full precision, 1.0 as "1", a missing one as ""."""
     if isinstance(value, np.generic):
         value = value.item()
-    if _is_missing(value):
+    if is_missing_value(value):
         return ""
     return number_text(value) if isinstance(value, float) else str(value)
 
@@ -262,7 +277,7 @@ def _checked_name(what: str, text: str) -> str:
     return text.strip()
 
 
-def _is_missing(cell: object) -> bool:
+def is_missing_value(cell: object) -> bool:
     """Return whether a cell is None, NaN, masked, or a data frame's marker of a missing value."""
     return (
         cell is None

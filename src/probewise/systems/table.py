@@ -37,7 +37,12 @@ from probewise.recordings.cells import (
     parsed_numbers,
     times_to_numbers,
 )
-from probewise.recordings.columns import notes_on_numbers_as_names, text_of_name
+from probewise.recordings.columns import (
+    is_missing_value,
+    notes_on_numbers_as_names,
+    require_one_order,
+    text_of_name,
+)
 from probewise.recordings.plan import masks_of_readings_at_ends
 from probewise.recordings.table import csv_text, number_text, read_table
 
@@ -97,6 +102,7 @@ class RunTable:
         allowed = "columns by name: a dict of arrays, or a data frame; of a file: read_run_table('DATA.csv', ...)"
         has_one_axis = getattr(self.columns, "ndim", 2) == 1  # a Series, whose items are its rows
         require(hasattr(self.columns, "items") and not has_one_axis, "table", self.columns, allowed)
+        require_one_order(self.columns)
         columns, notes = dict[str, NDArray[Any]](), [*self.notes]
         for name, given in self.columns.items():
             values: Any = given
@@ -360,6 +366,8 @@ def _checked_column(name: str, values: Any, *, are_names: bool) -> NDArray[Any]:
         raise ShapeError(f"column {name!r} has shape {array.shape}; allowed: one axis, one value for each row")
     if are_names and array.dtype.kind == "U" and not array.flags.writeable:
         return array
+    if array.dtype == object and not are_names:
+        array = np.array([None if is_missing_value(value) else value for value in array.tolist()], dtype=object)
     if array.dtype == object and all(value is None or isinstance(value, Real | Decimal) for value in array.tolist()):
         array = array if are_names else floats(array, f"column {name!r}")  # None is missing, NaN
     if array.dtype.kind in "biuf" and not are_names:

@@ -129,6 +129,11 @@ def test_every_pattern_kind_is_read(tmp_path):
     }
 
 
+def test_an_orientation_beyond_a_full_turn_is_noted(tmp_path):
+    path = put(tmp_path, "x_mm,y_mm,orientation_deg,reading\n0,0,90,1\n1,0,-9999,2\n")
+    assert read_recording(path).notes == ("row 3: orientation_deg is -9999, beyond a full turn: mistyped?",)
+
+
 def test_time_that_runs_backwards_is_noted(tmp_path):
     recording = read_recording(put(tmp_path, "x_mm,y_mm,reading,time_s\n0,0,1,5\n0,0,1,4\n"))
     assert recording.notes == ("time_s runs backwards at row 3",)

@@ -185,6 +185,7 @@ _KNOWN = ("reading", "x_mm", "y_mm", "orientation_deg", "scan", "pattern", "time
 _OF_A_LIGHT_SENSOR = (
     "a header row with it, in a recording by a light sensor; a table of anything else needs --simulator FILE.py"
 )
+_FULL_TURN_DEG = 360.0
 _FAR_AWAY = 100.0  # a place this many times the 5 to 95 % range of all places away looks mistyped
 PathLike = str | os.PathLike[str]
 
@@ -329,6 +330,9 @@ def _read_with_json(path: object, progress: Progress) -> tuple[Plan, FloatArray 
         raise FileError(path, "it is in radians", "orientation_deg, in degrees", row=1, column="orientation_rad")
     turned = "orientation_deg" in table.columns
     orientation_deg = table.column_of_numbers("orientation_deg") if turned else np.zeros(len(table))
+    if (beyond := np.flatnonzero(np.abs(orientation_deg) > _FULL_TURN_DEG)).size:
+        k = int(beyond[0])
+        notes.append(f"row {table.rows[k]}: orientation_deg is {orientation_deg[k]:g}, beyond a full turn: mistyped?")
     covariates = _covariate_columns(table, instrumentation.controls, notes)
     try:
         scan, scan_names = scan_codes_and_names(table.columns.get("scan"), len(table))

@@ -150,11 +150,6 @@ class LegoArm:
             self.geometry.mounting_rad + angles[BASE] - math.pi / 2 + np.nan_to_num(self.mounted_rad)
         )
         reading = Reading(value, Pose(x_mm, y_mm, float(turned_rad)), time_s, covariates)
-        self._raise_after_reading()
-        return reading
-
-    def _raise_after_reading(self) -> None:
-        """Raise the sensor; neither a lost connection nor a stop loses the reading that is complete."""
         try:
             # A connection lost now is noticed at the next move, which starts with raising.
             with contextlib.suppress(LinkError):
@@ -166,6 +161,7 @@ class LegoArm:
             except LinkError:
                 raise stop from None  # a motor may turn: the end of `with` stops it by other means
             self._stop = stop
+        return reading
 
     def _raise_held_stop(self) -> None:
         """Raise the KeyboardInterrupt that came while the sensor rose after the last reading, if there was one."""

@@ -234,7 +234,8 @@ class MomentCoordinates:
         out[..., 3] = np.log(0.5 * g[..., 4] / det)
         out[..., 4] = np.log(0.5 * g[..., 3] / det)
         out[..., 5] = np.arctanh(-g[..., 5] / np.sqrt(g[..., 3] * g[..., 4]))
-        out[:, 0, 1:3] = np.einsum("nk,nkj->nj", _mass_shares(out), g[..., 1:3])
+        masses = np.concatenate([np.ones((len(out), 1)), np.exp(np.clip(out[:, 1:, 0], -100.0, 0.0))], axis=1)
+        out[:, 0, 1:3] = np.einsum("nk,nkj->nj", masses / masses.sum(axis=1, keepdims=True), g[..., 1:3])
         return np.concatenate([out.reshape(len(theta), 6 * n), theta[:, 6 * n :]], axis=1)
 
     def leave(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -280,12 +281,6 @@ class MomentCoordinates:
 def view_by_kind_and_gaussian(columns: FloatArray) -> FloatArray:
     """View the Gaussians' columns, in (n_samples, 6 N + 2), as (6 kinds, N, n_samples), without a copy."""
     return columns[:, :-2].reshape(len(columns), columns.shape[1] // 6, 6).transpose(2, 1, 0)
-
-
-def _mass_shares(g: FloatArray) -> FloatArray:
-    """Each Gaussian's share of the mass, from coordinates (n_samples, N, 6) -> (n_samples, N)."""
-    ratio = np.concatenate([np.ones((len(g), 1)), np.exp(np.clip(g[:, 1:, 0], -100.0, 0.0))], axis=1)
-    return np.asarray(ratio / ratio.sum(axis=1, keepdims=True))
 
 
 @dataclass(frozen=True)

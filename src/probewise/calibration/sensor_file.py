@@ -265,6 +265,9 @@ class FittedSensor(NamedSamples):
     def to_json(self) -> str:
         """Return the sensor as strict JSON, format "sensor/1"."""
         mean, sd, rows = self.mean(), self.sd(), self.rows_by_parameter("mean", "sd", "median", "interval95")
+        acting = [effect.name for effect in self.effects_on_new_scans if effect.stage is Stage.NOISE]
+        known = [name.replace("_", " ") for name in acting]
+        plain = "Gaussian, one sd pooled over scans; one value per sample"
         document = {
             "format": FORMAT,
             "version": self.version,
@@ -280,7 +283,7 @@ class FittedSensor(NamedSamples):
             "origins": {name: asdict(origin) for name, origin in self.origins.items()},
             "absent": {name: np.flatnonzero(without).tolist() for name, without in self.absent.items()},
             "noise": {
-                "model": self._noise_in_words(),
+                "model": f"{plain}; with {' and '.join(known)}" if known else f"independent {plain}",
                 "mean": float(self.noise_sd.mean()),
                 "scans": [asdict(scan) for scan in self.scan_noise],
                 "sd": self.noise_sd.tolist(),
@@ -300,12 +303,6 @@ class FittedSensor(NamedSamples):
             "samples": self.samples.tolist(),
         }
         return json.dumps(document, allow_nan=False) + "\n"
-
-    def _noise_in_words(self) -> str:
-        acting = [effect.name for effect in self.effects_on_new_scans if effect.stage is Stage.NOISE]
-        known = [name.replace("_", " ") for name in acting]
-        plain = "Gaussian, one sd pooled over scans; one value per sample"
-        return f"{plain}; with {' and '.join(known)}" if known else f"independent {plain}"
 
     @classmethod
     def from_json(cls, text: str, path: str | os.PathLike[str] = "sensor.json") -> FittedSensor:

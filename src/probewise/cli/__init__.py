@@ -31,7 +31,10 @@ __all__ = ["VERBS", "main", "parser"]
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one verb of the command line, by default on the process's arguments, and return the exit status."""
     words = sys.argv[1:] if argv is None else list(argv)
-    _replace_closed_streams()
+    # The null device in place of streams that the shell closed (>&-): the next file would take their number.
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))  # noqa: SIM115
     try:
         arguments = parser().parse_args(words)
     except SystemExit as stop:  # argparse exits this way after --help, --version and errors
@@ -60,13 +63,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             print_complaint(f"probewise {verb}: {said}")
         _discard_unwritable_output()
         return status
-
-
-def _replace_closed_streams() -> None:
-    """Open the null device in place of streams that the shell closed (>&-): the next file would take their number."""
-    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
-        if getattr(sys, name) is None:
-            setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))  # noqa: SIM115
 
 
 def _discard_unwritable_output() -> None:

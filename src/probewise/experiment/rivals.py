@@ -84,8 +84,21 @@ def rivals_of(
     dark, bright = model.levels.i_min, model.levels.i_max
     carried = {effect.name for effect in model.effects}
     rivals = []
+    n = 2 * int(_DURATION_S / PACED_S_PER_READING / 2) + 1
+    zeros = np.zeros(n, dtype=np.int64)
     for kind in (*ON_FIELD, *(WITH_CARDS if cards_of(model) else WITHOUT_CARDS)):
-        plan = _plan_there_and_back(math.hypot(*field_mm) if kind in _OF_WHOLE_FIELD else _SCAN_MM, height_mm)
+        length_mm = math.hypot(*field_mm) if kind in _OF_WHOLE_FIELD else _SCAN_MM
+        plan = Plan(  # a scan there and back, from which effects take their scales
+            x_mm=length_mm * (1.0 - np.abs(np.linspace(-1.0, 1.0, n))),
+            y_mm=np.zeros(n),
+            orientation_rad=np.zeros(n),
+            time_s=np.linspace(0.0, _DURATION_S, n),
+            scan=zeros,
+            scan_names=("field",),
+            pattern=zeros,
+            pattern_names=("field",),
+            instrumentation=Instrumentation(height_mm=height_mm),
+        )
         effect = kind.for_extent(Extent(min(dark, bright), max(dark, bright), plan))
         if effect is not None and carried.isdisjoint(kind.name.split("+")):
             in_run = replace(effect, parameters=_prior_for_run(effect, field_mm))
@@ -97,23 +110,6 @@ def rivals_of(
     noise = DeclaredNoise.from_likelihood(likelihood)
     laws = {} if noise is None else noise_likelihoods(noise, (dark, bright))
     return (*rivals, *(SensorModelRival(name, likelihood=law) for name, law in laws.items()))
-
-
-def _plan_there_and_back(length_mm: float, height_mm: float | None) -> Plan:
-    """Return a plan of one scan of `length_mm` there and back over 150 s, from which effects take their scales."""
-    n = 2 * int(_DURATION_S / PACED_S_PER_READING / 2) + 1
-    zeros = np.zeros(n, dtype=np.int64)
-    return Plan(
-        x_mm=length_mm * (1.0 - np.abs(np.linspace(-1.0, 1.0, n))),
-        y_mm=np.zeros(n),
-        orientation_rad=np.zeros(n),
-        time_s=np.linspace(0.0, _DURATION_S, n),
-        scan=zeros,
-        scan_names=("field",),
-        pattern=zeros,
-        pattern_names=("field",),
-        instrumentation=Instrumentation(height_mm=height_mm),
-    )
 
 
 @light_effect("gain_drift", Stage.GAIN, "a gain that drifts", ("time",), counts="time")

@@ -100,7 +100,11 @@ class DiscTable:
         if not isinstance(model.ssf, FixedMixture) or not all(map(is_known_footprint_effect, model.effects)):
             return None
         dark, bright = _readings_outside_and_inside(model, high)
-        directions = _unit_vectors_of_pseudo_angles(np.linspace(0.0, 4.0, _DIRECTIONS, endpoint=False))
+        pseudo_angle = np.linspace(0.0, 4.0, _DIRECTIONS, endpoint=False)
+        upper = pseudo_angle <= 2.0
+        across = np.where(upper, 1.0 - pseudo_angle, pseudo_angle - 3.0)
+        up = np.where(upper, 1.0, -1.0) * (1.0 - np.abs(across))
+        directions = np.stack([across, up], axis=-1) / np.hypot(across, up)[:, None]
         margin = _distance_to_constant_reading_mm(model, low, high, directions[:: _DIRECTIONS // 16], dark, bright)
         if margin >= _PROBE_MM:
             return None
@@ -298,14 +302,6 @@ def _pseudo_angle(x: FloatArray, y: FloatArray) -> FloatArray:
     """Return a pseudo-angle from 0 to 4 around the origin: it rises with the angle, but needs no trigonometry."""
     across = x / np.maximum(np.abs(x) + np.abs(y), _TINY)
     return np.asarray(2.0 - np.copysign(1.0 + across, y))
-
-
-def _unit_vectors_of_pseudo_angles(pseudo_angle: FloatArray) -> FloatArray:
-    """Convert pseudo-angles to unit vectors, (n, 2)."""
-    upper = pseudo_angle <= 2.0
-    across = np.where(upper, 1.0 - pseudo_angle, pseudo_angle - 3.0)
-    up = np.where(upper, 1.0, -1.0) * (1.0 - np.abs(across))
-    return np.asarray(np.stack([across, up], axis=-1) / np.hypot(across, up)[:, None])
 
 
 def _index_and_fraction(position: FloatArray, n: int) -> tuple[IntArray, FloatArray]:

@@ -190,24 +190,17 @@ def animated_gif(frames: Sequence[bytes], *, frame_s: float = _FRAME_S, last_s: 
     """Join one or more PNGs of one size into an animated GIF that loops for ever."""
     require(frames, "frames", 0, "one picture or more")
     sheets = [Image.open(io.BytesIO(frame)).convert("RGB") for frame in frames]
-    palette = _common_palette(sheets)
+    # One palette for all frames, or a colour would change; it covers the range of colours, whatever their frequency.
+    seen = [np.array([colour for _, colour in sheet.getcolors(sheet.width * sheet.height) or []]) for sheet in sheets]
+    levels = (255 // _ROUNDED + 1,) * 3
+    codes = np.unique(np.ravel_multi_index(np.rint(np.concatenate(seen).T / _ROUNDED).astype(np.int64), levels))
+    colours = (_ROUNDED * np.stack(np.unravel_index(codes, levels), axis=-1)).astype(np.uint8)
+    palette = Image.fromarray(colours[None]).quantize(_COLOURS, method=Image.Quantize.MAXCOVERAGE)
     sheets = [sheet.quantize(palette=palette, dither=Image.Dither.NONE) for sheet in sheets]
     durations = [round(1000 * frame_s)] * (len(sheets) - 1) + [round(1000 * last_s)]
     out = io.BytesIO()
     sheets[0].save(out, "GIF", save_all=True, append_images=sheets[1:], duration=durations, loop=0)
     return out.getvalue()
-
-
-def _common_palette(sheets: Sequence[Image.Image]) -> Image.Image:
-    """Return a palette image of 256 colours that all frames share; with one palette each, a colour would change.
-
-    The palette covers the range of colours, whatever their frequency, so that small squares keep their rare colours.
-    """
-    seen = [np.array([colour for _, colour in sheet.getcolors(sheet.width * sheet.height) or []]) for sheet in sheets]
-    levels = (255 // _ROUNDED + 1,) * 3
-    codes = np.unique(np.ravel_multi_index(np.rint(np.concatenate(seen).T / _ROUNDED).astype(np.int64), levels))
-    colours = (_ROUNDED * np.stack(np.unravel_index(codes, levels), axis=-1)).astype(np.uint8)
-    return Image.fromarray(colours[None]).quantize(_COLOURS, method=Image.Quantize.MAXCOVERAGE)
 
 
 def summary_sentence(run: Exploration) -> str:

@@ -206,25 +206,15 @@ def _axis_limits(result: Samples, column: int) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _centres_and_smoothed_density(
-    values: FloatArray, weight: FloatArray, span: tuple[float, float], n_eff: float
-) -> tuple[FloatArray, FloatArray]:
-    """Return the middles of 80 bins and the smoothed weight of the values in each, (80,) each.
-
-    The kernel has three quarters of Silverman's width, since posteriors may have several modes. It is reflected at the
-    ends, where the prior may cut the density off.
-    """
-    density, edges = np.histogram(values, bins=80, range=span, weights=weight)
+def _draw_marginal(ax: Axes, result: Samples, column: int, span: tuple[float, float], *, titled: bool) -> None:
+    density, edges = np.histogram(result.theta[:, column], bins=80, range=span, weights=result.weight)
     centres = (edges[:-1] + edges[1:]) / 2
     total = max(float(density.sum()), 1e-300)
     middle = float(density @ centres) / total
     sd = np.sqrt(float(density @ (centres - middle) ** 2) / total) / (edges[1] - edges[0])
-    width = max(0.8 * sd * max(n_eff, 1.0) ** -0.2, 0.5)
-    return centres, np.asarray(gaussian_filter1d(density, width, mode="reflect"))
-
-
-def _draw_marginal(ax: Axes, result: Samples, column: int, span: tuple[float, float], *, titled: bool) -> None:
-    centres, density = _centres_and_smoothed_density(result.theta[:, column], result.weight, span, result.n_eff)
+    # Three quarters of Silverman's width, since posteriors may have several modes; reflected at the prior's ends.
+    width = max(0.8 * sd * max(result.n_eff, 1.0) ** -0.2, 0.5)
+    density = gaussian_filter1d(density, width, mode="reflect")
     cuts = result.interval(_MASSES[1])[:, column], result.interval(_MASSES[0])[:, column]
     ax.plot(centres, density, color=canvas.BLUE)
     for (low, high), colour in zip(cuts, _SHADES, strict=True):

@@ -8,7 +8,6 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 
-from probewise._arrays import FloatArray
 from probewise._kinds import require_kind
 from probewise._words import count_with_noun
 from probewise.report.plots import canvas
@@ -27,21 +26,17 @@ def spatial_sensitivity(field: SSFField, *, ax: Axes | None = None, title: str =
     canvas.add_colour_bar(ax, image, "sensitivity (share of its peak)")
     ax.contour(x, y, values, levels=[0.1 * peak, 0.5 * peak], colors="white", linewidths=[0.8, 1.4])
     ax.plot([0], [0], marker="+", color="white", markersize=10, markeredgewidth=1.5)
-    _set_half_width(ax, _visible_half_width(values, x, y, field.pixel_mm))
+    # A square about the origin that holds the SSF above 1 % of its peak, its half width rounded up.
+    matters = values > 0.01 * values.max()
+    far = 1.1 * max(np.abs(x[matters.any(axis=0)]).max(), np.abs(y[matters.any(axis=1)]).max(), field.pixel_mm)
+    unit = 0.5 * 10 ** np.floor(np.log10(far))
+    _set_half_width(ax, float(unit * np.ceil(far / unit)))
     ax.set_aspect("equal")
     return canvas.label_axes(ax, x="x' (mm)", y="y' (mm)", title=title)
 
 
 def _set_half_width(ax: Axes, reach_mm: float) -> None:
     ax.set(xlim=(-reach_mm, reach_mm), ylim=(-reach_mm, reach_mm))
-
-
-def _visible_half_width(values: FloatArray, x: FloatArray, y: FloatArray, pixel_mm: float) -> float:
-    """Return the half width (mm), rounded up, of a square about the origin that holds the SSF above 1 % of its peak."""
-    matters = values > 0.01 * values.max()
-    far = 1.1 * max(np.abs(x[matters.any(axis=0)]).max(), np.abs(y[matters.any(axis=1)]).max(), pixel_mm)
-    unit = 0.5 * 10 ** np.floor(np.log10(far))
-    return float(unit * np.ceil(far / unit))
 
 
 def ssf_by_n_gaussians(

@@ -134,7 +134,13 @@ def fit_geometry(
     if p_value < LEAST_P:
         raise MarksDisagreeError(_disagreement_message(geometry, turned, marks, touch_mm, residuals))
     covariance: FloatArray = np.asarray(np.linalg.inv(jacobian.T @ jacobian), dtype=np.float64)
-    fitted = _geometry_with_values(geometry, values)
+    joints: dict[str, Any] = {}  # their limits and stops, counted from home, shift with the home angles
+    for name, joint, home in zip(JOINTS, geometry.joints, values[:3].tolist(), strict=True):
+        ends = {end: getattr(joint, end) for end in ("low_rad", "high_rad", "stop_rad")}
+        shifted = {end: angle + (home - joint.home_rad) for end, angle in ends.items() if angle is not None}
+        joints[name] = replace(joint, home_rad=home, **shifted)
+    upper, lower, x, y, forward, height = values[3:].tolist()
+    fitted = replace(geometry, axis_mm=(x, y), shoulder_mm=(forward, height), links_mm=(upper, lower), **joints)
     accuracy = _accuracy_of_fit(fitted, covariance, len(marks))
     if accuracy.height_sd_mm > MOST_HEIGHT_SD_MM or accuracy.place_sd_mm > MOST_PLACE_SD_MM:
         left_open = f"the height open to {accuracy.height_sd_mm:.1f} mm and the place to {accuracy.place_sd_mm:.1f} mm"
@@ -196,17 +202,6 @@ def _accuracy_of_fit(geometry: Geometry, covariance: FloatArray, n_marks: int) -
         float(np.sqrt(stretch @ covariance @ stretch)),
         tuple(tuple(row) for row in covariance.tolist()),
     )
-
-
-def _geometry_with_values(geometry: Geometry, values: FloatArray) -> Geometry:
-    """Return the geometry with values of `FITTED`; limits and stops, counted from home, shift with the home angles."""
-    joints: dict[str, Any] = {}
-    for name, joint, home in zip(JOINTS, geometry.joints, values[:3].tolist(), strict=True):
-        ends = {end: getattr(joint, end) for end in ("low_rad", "high_rad", "stop_rad")}
-        shifted = {end: angle + (home - joint.home_rad) for end, angle in ends.items() if angle is not None}
-        joints[name] = replace(joint, home_rad=home, **shifted)
-    upper, lower, x, y, forward, height = values[3:].tolist()
-    return replace(geometry, axis_mm=(x, y), shoulder_mm=(forward, height), links_mm=(upper, lower), **joints)
 
 
 # A check of the height by the light: over white, a lower sensor reads more. How a reading falls with the height is

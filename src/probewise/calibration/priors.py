@@ -332,7 +332,10 @@ def scan_geometry(recording: Recording) -> ScanGeometry:
     span = float(np.median(lengths)) if lengths else extent
     # Places far apart, such as those a robot chooses, do not bound the footprint from below: use a factor of 50.
     step = min(float(np.median(np.concatenate(moves))) if moves else span, span / 50)
-    albedo = _albedo_at_commanded_places(recording)[usable]
+    regions, albedo = KnownScene(plan.patterns).regions(np.empty((1, 0))), np.empty(len(plan))
+    for name, rows in plan.rows_by_pattern():
+        albedo[rows] = regions[name].albedo(place[rows])[0]
+    albedo = albedo[usable]
     albedo_low, albedo_high = float(albedo.min()), float(albedo.max())
     found = f"albedo {albedo_low:g} under every usable place"
     require(albedo_low < albedo_high, "recording", found, "places on both sides of an edge")
@@ -421,14 +424,3 @@ def blind_axis_rad(recording: Recording) -> float | None:
     if np.abs(seen - seen[0]).max() > _SAME_AXIS:
         return None
     return float((np.angle(seen[0]) / 2 + math.pi / 2) % math.pi)
-
-
-def _albedo_at_commanded_places(recording: Recording) -> FloatArray:
-    """Return the albedo of the known patterns at the commanded positions, (n_points,)."""
-    plan = recording.plan
-    regions = KnownScene(plan.patterns).regions(np.empty((1, 0)))
-    out = np.empty(len(plan))
-    for name, rows in plan.rows_by_pattern():
-        points = np.stack([plan.x_mm[rows], plan.y_mm[rows]], axis=-1)
-        out[rows] = regions[name].albedo(points)[0]
-    return out

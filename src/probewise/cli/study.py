@@ -22,7 +22,11 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the study's remaining tasks; write its table and report; return the exit status."""
     file = "concealed.jsonl" if arguments.concealed else "trials.jsonl"
     checked_output_directory(arguments.out, file, main=file)
-    command = _command_line(arguments)
+    words = ["probewise", "study", *(["--concealed"] if arguments.concealed else [])]
+    names = _OF_CONCEALED if arguments.concealed else ("quoted", "beside_paper", *_FACTORS)
+    for name, value in _given(arguments, ("circles", *names, "max_readings")).items():
+        words += [f"--{name.replace('_', '-')}"] + ([] if value is True else [str(value)])
+    command = shlex.join(words)
     if arguments.concealed:
         refuse_options(arguments, "--concealed, which has its own rows", *_FACTORS, "quoted", "beside_paper")
         hiding = concealed_study(
@@ -63,11 +67,3 @@ def _configuration_rows(arguments: argparse.Namespace) -> tuple[SearchConfigurat
     if "noise" in given:
         given["noise_sd"] = given.pop("noise")
     return (SearchConfiguration(**given),)
-
-
-def _command_line(arguments: argparse.Namespace) -> str:
-    words = ["probewise", "study", *(["--concealed"] if arguments.concealed else [])]
-    names = _OF_CONCEALED if arguments.concealed else ("quoted", "beside_paper", *_FACTORS)
-    for name, value in _given(arguments, ("circles", *names, "max_readings")).items():
-        words += [f"--{name.replace('_', '-')}"] + ([] if value is True else [str(value)])
-    return shlex.join(words)

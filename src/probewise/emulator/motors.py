@@ -139,9 +139,19 @@ class OutputPort:
         self._moved += turned
         self._clock_ms += 1
         if self.run_state == RUNNING:
-            self._stop_at_limit()
+            if self._endless:
+                if self.target_power:
+                    self._goal = self.tacho_count
+            elif self.set_power and (self.tacho_count - self._goal) * self.set_power >= 0:
+                self.run_state, self._regulated = IDLE, False
+            if not self._regulated:
+                self.power = clipped(self.target_power, 100)
         if self.run_state == IDLE:
-            self._fade_power()
+            # After a limit the power falls by 1 a millisecond: a host sees IDLE well before the motor rests.
+            self._brake = False
+            self.power, self.target_power, self.set_power = (
+                power - (power > 0) + (power < 0) for power in (self.power, self.target_power, self.set_power)
+            )
         if self._clock_ms > _REGULATION_MS:
             self._regulate()
 
@@ -170,23 +180,6 @@ class OutputPort:
             if not power:  # hold the present position
                 self.power = self._clock_ms = self._moved = 0
         self.run_state = run_state
-
-    def _stop_at_limit(self) -> None:
-        """Become idle at the limit; without a limit, let the goal follow the motor."""
-        if self._endless:
-            if self.target_power:
-                self._goal = self.tacho_count
-        elif self.set_power and (self.tacho_count - self._goal) * self.set_power >= 0:
-            self.run_state, self._regulated = IDLE, False
-        if not self._regulated:
-            self.power = clipped(self.target_power, 100)
-
-    def _fade_power(self) -> None:
-        """Reduce the power by 1 per millisecond after a limit: a host sees IDLE well before the motor rests."""
-        self._brake = False
-        self.power, self.target_power, self.set_power = (
-            power - (power > 0) + (power < 0) for power in (self.power, self.target_power, self.set_power)
-        )
 
     def _regulate(self) -> None:
         """Set the power by the firmware's PID regulator, which acts every 101 ms."""

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.arm.geometry import FITTED, Accuracy, Geometry, place_jacobian
+from probewise.arm.geometry import FITTED, place_jacobian
 from probewise.arm.instrument import Reading
 from probewise.errors import require
 from probewise.experiment.kinds import HypothesisKind, PosteriorByKind
@@ -75,7 +75,16 @@ def arm_error_in_posterior(
     assert accuracy is not None
     recording = experiment.problem(readings).recording
     places = np.stack([recording.plan.x_mm, recording.plan.y_mm], axis=-1)
-    off = _pose_changes_per_error_sd(geometry, np.concatenate([places, [arm.calibration_place_mm]]), accuracy)
+    covariance = np.array(accuracy.covariance)
+    scale = np.sqrt(np.diagonal(covariance))
+    scale = np.where(scale > 0, scale, 1.0)  # radians and mm: the numbers differ by orders of magnitude
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    root = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+    # Changes of x, y, height and orientation at each place by each independent error of one sd.
+    place = place_jacobian(geometry, np.concatenate([places, [arm.calibration_place_mm]])) @ root
+    require(np.isfinite(place).all(), "readings", "a place out of the arm's reach", "readings of this arm")
+    turned = np.broadcast_to(root[FITTED.index("base home")], place[:, :1].shape)
+    off = np.concatenate([place, turned], axis=1)
     off[:, 2] -= off[-1, 2]
     off = off[:-1]
     dark, white = arm.levels
@@ -91,22 +100,6 @@ def arm_error_in_posterior(
     if isinstance(experiment.shape, AnyOf):
         shifts[experiment.shape.shape_index(theta) != experiment.shape.shape_names.index(likely_shape)] = 0.0
     return ArmError(slopes, shifts)
-
-
-def _pose_changes_per_error_sd(geometry: Geometry, places_mm: FloatArray, accuracy: Accuracy) -> FloatArray:
-    """Return the change of x, y, height and orientation at places, (n_points, 2), by each independent error of one sd.
-
-    The result is (n_points, 4, n_errors). Raises ParameterError for a place out of the arm's reach.
-    """
-    covariance = np.array(accuracy.covariance)
-    scale = np.sqrt(np.diagonal(covariance))
-    scale = np.where(scale > 0, scale, 1.0)  # radians and mm: the numbers differ by orders of magnitude
-    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    root = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
-    place = place_jacobian(geometry, places_mm) @ root
-    require(np.isfinite(place).all(), "readings", "a place out of the arm's reach", "readings of this arm")
-    turned = np.broadcast_to(root[FITTED.index("base home")], place[:, :1].shape)
-    return np.concatenate([place, turned], axis=1)
 
 
 def _posterior_mean_shifts(

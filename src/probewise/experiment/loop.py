@@ -243,7 +243,11 @@ def explore(
     require_kind("experiment", experiment, Experiment, "an Experiment, such as experiment_for(...) poses")
     require_rng(rng)
     checked_whole("max_readings", max_readings)
-    seed = _run_seed(rng)
+    # Another seed at each call, whatever was drawn in between.
+    seed = rng.bit_generator.seed_seq
+    if not isinstance(seed, np.random.SeedSequence):
+        seed = np.random.SeedSequence([int(word) for word in rng.integers(2**32, size=4)])
+    seed = seed.spawn(1)[0]
     path = None if journal is None else checked_path("journal", getattr(journal, "path", journal))
     before = journal if isinstance(journal, Journal) else None
     if before is None and path is not None and path.exists():
@@ -372,14 +376,6 @@ def _require_possible_reading(experiment: Experiment, reading: Reading, journal:
         if journal is not None:
             raise FileError(journal.path, f"{error.name} is {error.value}", error.allowed, row=number + 1) from error
         raise LinkError(f"what the instrument returned is beyond the sensor: {error}") from error
-
-
-def _run_seed(rng: np.random.Generator) -> np.random.SeedSequence:
-    """Spawn a run's seed from the generator's seed sequence: another at each call, whatever was drawn in between."""
-    seed = rng.bit_generator.seed_seq
-    if not isinstance(seed, np.random.SeedSequence):
-        seed = np.random.SeedSequence([int(word) for word in rng.integers(2**32, size=4)])
-    return seed.spawn(1)[0]
 
 
 def _rng_of_reading(seed: np.random.SeedSequence, number: int) -> np.random.Generator:

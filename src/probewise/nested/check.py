@@ -374,7 +374,10 @@ def check_and_repeat(
     limit = min(max_cost * first.n_calls, math.inf if max_calls is None else max_calls)
     budget, now, check = _Budget(search, limit, first.n_calls, rng), first, None
     try:
-        chain = _with_longer_chains(move)
+        least = SliceMove()  # whose chains, or the run's if longer, are doubled
+        chain = move if isinstance(move, SliceMove) else least
+        steps, fewest = max(chain.steps_per_param, least.steps_per_param), max(chain.fewest_steps, least.fewest_steps)
+        chain = replace(chain, steps_per_param=2.0 * steps, fewest_steps=2 * fewest)
         second = _second_estimate(first, evaluate, budget, chain, least_live)
         if second is None:
             # An estimate that should cost a fifth of the run and does not end is itself a sign of trouble.
@@ -447,10 +450,3 @@ def _second_estimate(
     if second.disagreement_in_words(first) and not second.missing_part_in_words(first) and n_more > n_live:
         second = replace(second, run=budget.run(posed, n_more, chain) or found)
     return second
-
-
-def _with_longer_chains(move: Move) -> SliceMove:
-    least = SliceMove()
-    chain = move if isinstance(move, SliceMove) else least
-    steps, fewest = max(chain.steps_per_param, least.steps_per_param), max(chain.fewest_steps, least.fewest_steps)
-    return replace(chain, steps_per_param=2.0 * steps, fewest_steps=2 * fewest)

@@ -262,7 +262,6 @@ class Joint:
         return sum((part.log_prob(c) for part, c in self._parts_with_columns(theta)), np.zeros(len(theta)))
 
     def _parts_with_columns(self, columns: FloatArray) -> list[tuple[Prior, FloatArray]]:
-        """Return pairs of a part and its columns, (n_samples, n_params of the part)."""
         columns = checked_columns(columns, self.names)
         ends = np.cumsum([len(p.names) for p in self.parts])
         return [(p, columns[:, end - len(p.names) : end]) for p, end in zip(self.parts, ends, strict=True)]

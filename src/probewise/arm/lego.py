@@ -164,7 +164,6 @@ class LegoArm:
         return reading
 
     def _raise_held_stop(self) -> None:
-        """Raise the KeyboardInterrupt that came while the sensor rose after the last reading, if there was one."""
         stop, self._stop = self._stop, None
         if stop is not None:
             raise stop
@@ -255,7 +254,6 @@ class LegoArm:
         self._turn_joint_to(joint, self._goals_at_angles(angles)[joint])
 
     def _goals_at_place(self, x_mm: float, y_mm: float, height_mm: float) -> list[JointTarget]:
-        """Return the targets of base, shoulder and elbow for a place and height; ReachError if it is out of reach."""
         angles = self.geometry.angles_rad(np.array([[x_mm, y_mm]]), height_mm)[0]
         if not np.isfinite(angles).all():
             raise ReachError("the place (mm)", (round(x_mm, 1), round(y_mm, 1)), self.geometry.sentence())

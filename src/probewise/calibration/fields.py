@@ -134,7 +134,6 @@ def posterior_mean_ssf_field(
 
 
 def _mass_quantile_999(values: FloatArray, mass: FloatArray) -> float:
-    """Smallest of the values up to which 0.999 of the mass lies; both arrays have one shape."""
     flat, weight = values.ravel(), mass.ravel()
     order = np.argsort(flat)
     ladder = np.cumsum(weight[order])

@@ -450,6 +450,5 @@ def _read(path: object, value: Any, form: Any, place: str = "") -> Any:
 
 
 def _mask_of_rows(rows: FloatArray, n: int) -> BoolArray:
-    """Convert the numbers of rows to a mask, (n,)."""
     require(np.isin(rows, np.arange(n)).all(), "absent", rows.tolist(), f"whole numbers from 0 to {n - 1}")
     return np.isin(np.arange(n), rows)

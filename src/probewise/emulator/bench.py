@@ -248,7 +248,6 @@ class LightModel:
 
 
 def _led_brightness_at_height(height_mm: float) -> float:
-    """Return the relative brightness of the LED at a height, 1 at the brightest."""
     steps = max(height_mm, 0.0) / _BRIGHTEST_MM
     return steps * math.exp(1 - steps)
 

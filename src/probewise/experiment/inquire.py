@@ -484,10 +484,8 @@ def far_side(
 
 
 def _places_mm(inputs: UtilityInput) -> FloatArray:
-    """Return x and y of the available designs, (n, 2)."""
     return np.stack([inputs.plan.x_mm[inputs.rows], inputs.plan.y_mm[inputs.rows]], axis=1)
 
 
 def _places_of(readings: Sequence[Reading]) -> FloatArray:
-    """Return x and y of readings, (n, 2)."""
     return np.array([[reading.pose.x_mm, reading.pose.y_mm] for reading in readings]).reshape(-1, 2)

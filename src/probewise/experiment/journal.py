@@ -187,7 +187,6 @@ def _parse_summary(line: Mapping[str, Any]) -> PosteriorSummary:
 
 
 def _null_if_nan(value: float) -> float | None:
-    """Return None for NaN (a missing reading or covariate) and infinities, which JSON lacks; else the value."""
     return value if math.isfinite(value) else None
 
 
@@ -209,7 +208,6 @@ def _parse_pose(line: Mapping[str, Any]) -> Pose:
 
 
 def _pose_as_json(pose: Pose) -> dict[str, float]:
-    """Convert a pose to JSON; with the height only if it was chosen."""
     return {name: value for name, value in dataclasses.asdict(pose).items() if value is not None}
 
 

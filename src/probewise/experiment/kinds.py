@@ -174,7 +174,6 @@ def _kind(
     likelihood: Likelihood,
     effect: Effect | None = None,
 ) -> HypothesisKind:
-    """Build a kind of a shape, with its `share` of the shape's probability and a model of all parameters."""
     log_prior = math.log(member.share) + math.log(share)
     return HypothesisKind(member, left_out, log_prior, prior, member.restrict_model(model), likelihood, effect)
 

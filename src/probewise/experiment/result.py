@@ -272,7 +272,6 @@ class Exploration(Reported):
 
 
 def _number(name: str, value: float, *, more: int = 0) -> str:
-    """Return a parameter's value with one decimal, or three for one in radians, or `more`."""
     return f"{value:.{(3 if name.endswith('_rad') else 1) + more}f}"
 
 
@@ -427,7 +426,6 @@ def left_out_after_step(last: Step, trust: float) -> LeftOutEffects:
 
 
 def _best_kind_with(last: Step, name: str) -> tuple[HypothesisKind, Weighted]:
-    """Return the most probable kind with a left-out effect, and its samples."""
     kinds = [k for k, kind in enumerate(last.by_kind.kinds) if kind.left_out == name]
     best = max(kinds, key=lambda k: last.by_kind.log_odds[k])
     return last.by_kind.kinds[best], last.by_kind.particles[best].weighted

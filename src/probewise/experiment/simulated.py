@@ -250,10 +250,6 @@ class HiddenShape:
 
 
 def _theta_in_prior_order(names: Sequence[str], values: object) -> FloatArray:
-    """Convert parameters, given by name or already in order, to an array in the order of `names`, (n_params,).
-
-    Raises ParameterError if the names of the parameters are not `names`.
-    """
     if not isinstance(values, Mapping):
         return floats(values, "truth")  # type: ignore[arg-type]
     require(set(values) == set(names), "truth", values, f"one number for each of {', '.join(names)}")

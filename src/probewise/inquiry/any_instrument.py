@@ -576,7 +576,6 @@ class Inquiry(ShowsItself):
 
     @property
     def _largest_sd_over_goal(self) -> float:
-        """Largest ratio of a posterior sd to its goal."""
         sd = dict(zip(self.posterior.names, self.posterior.sd(), strict=True))
         return float(max(sd[name] / goal for name, goal in self._goal.items()))
 
@@ -630,12 +629,10 @@ class Inquiry(ShowsItself):
         return given.information_bits
 
     def _choose(self, utility: FloatArray) -> int:
-        """Draw the index of a setting at random among the best."""
         return int(self._rng.choice(np.flatnonzero(utility >= utility.max() - _TIE)))
 
     @property
     def _last_setting(self) -> Any:
-        """Setting of the last reading; None before the first."""
         return self._taken[-1][0][0] if self._taken else None
 
     def _costs_s(self, last: Any) -> FloatArray:

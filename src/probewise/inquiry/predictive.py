@@ -219,7 +219,6 @@ class WeightsGivenReading:
 
     @cached_property
     def _weight_by_level(self) -> FloatArray:
-        """Total weight of the hypotheses at each level, (n_designs, n_levels)."""
         return weight_by_level(self.index, self.weight, len(self.chance))
 
     def weighted_sum_by_cell(self, values: FloatArray) -> FloatArray:

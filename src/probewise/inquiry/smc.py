@@ -521,5 +521,4 @@ def _nearest_rows(points: FloatArray, rows: IntArray, n: int) -> IntArray:
 
 @cache
 def _upper_triangle_indices(n_params: int) -> tuple[IntArray, IntArray]:
-    """Return row and column indices of the upper triangle of a matrix, diagonal included."""
     return np.triu_indices(n_params)

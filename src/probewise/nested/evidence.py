@@ -87,7 +87,6 @@ def integrate(
 
 
 def _log_shell_volumes(log_edges: FloatArray) -> FloatArray:
-    """Return the log volume between successive edges along the last axis; the last shell ends at zero volume."""
     before, after = log_edges[..., :-1], log_edges[..., 1:].copy()
     after[..., -1] = -np.inf
     with np.errstate(divide="ignore"):

@@ -272,7 +272,6 @@ def notes_on_numbers_as_names(column: str, values: object, named: str) -> list[s
 
 
 def _checked_name(what: str, text: str) -> str:
-    """Return a name without surrounding blanks, as in a file; raise ParameterError if it is not printable."""
     require(text.strip().isprintable(), what, text, "a printable text, without line ends")
     return text.strip()
 

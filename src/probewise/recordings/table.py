@@ -209,13 +209,11 @@ def _are_numbers(cells: Sequence[str]) -> bool:
 
 
 def _holds_numbers(row: Sequence[str], numeric: frozenset[int]) -> bool:
-    """Return whether a row has numbers, times or missing cells in all columns of numbers."""
     cells = [row[j] for j in numeric]
     return _are_numbers(cells) and all(is_missing(cell) or _is_value(cell) for cell in cells)
 
 
 def _holds_units(row: Sequence[str], numeric: frozenset[int]) -> bool:
-    """Return whether a row has a text but no number in the columns of numbers, as a row of units."""
     cells = [row[j] for j in numeric if j < len(row)]
     filled = [cell for cell in cells if not is_missing(cell) or set(cell) == {"-"}]  # or a line below the header
     return bool(filled) and not any(_is_value(cell) for cell in filled)

@@ -117,7 +117,6 @@ def parameter_table(sensor: FittedSensor) -> Markup:
 
 
 def _posterior_table(first: str, rows: Iterable[tuple[str, str, float, tuple[float, float]]], caption: str) -> Markup:
-    """Build a table of posteriors; `rows` are names, units, medians and 95 % intervals."""
     cells = [(name, _printed_unit(unit), *value_and_interval_texts(value, *ends)) for name, unit, value, ends in rows]
     return table((first, "unit", "median", "95 % interval"), cells, caption=caption)
 

@@ -365,7 +365,6 @@ def _effect_table(effects: Sequence[EffectFound]) -> html.Markup:
 
 
 def _value_and_interval_texts(found: ParameterFound, *, unit: bool = False) -> tuple[str, str]:
-    """Return two texts: a parameter's mean ± sd (with its unit if `unit`), and its 95 % interval."""
     low, high = found.interval95
     written = value_with_sd(found.mean, found.sd, found.unit if unit else "")
     return typeset_numbers(written), typeset_numbers(range_text(low, high))

@@ -154,7 +154,6 @@ def before_and_after(diagnosis: Diagnosis) -> AxesGrid:
 
 
 def _noise_tests_svg(diagnosis: Diagnosis) -> bytes:
-    """Draw the tests of the noise model: autocorrelation, spread by predicted reading, histogram."""
     axes = stack_of_axes([2.2, 2.4, 2.2])
     for ax, name in zip(axes, ("correlated_noise", "signal_dependent_noise", "outliers"), strict=True):
         _draw_noise_panel(diagnosis, name, ax)

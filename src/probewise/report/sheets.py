@@ -186,7 +186,6 @@ def arm_home_jig_sheet(geometry: Geometry) -> Sheet:
 
 
 def _sheet_corners_around(points_mm: FloatArray, margin_mm: float) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the lower left and upper right corner of a sheet that shows points, (n, 2), with a margin."""
     low = np.floor((points_mm.min(axis=0) - margin_mm) / _ROUND_MM) * _ROUND_MM
     high = np.ceil((points_mm.max(axis=0) + margin_mm) / _ROUND_MM) * _ROUND_MM
     (x_low, y_low), (x_high, y_high) = low.tolist(), high.tolist()

@@ -283,7 +283,6 @@ class Chain:
 
     @cached_property
     def _effects_and_columns(self) -> list[tuple[AnyEffect, slice]]:
-        """Each effect with the slice of its columns of theta."""
         first = len(self.ssf.names) + len(self.levels.names) + len(self.scene.names)
         return effects_with_columns(self.effects, first)
 

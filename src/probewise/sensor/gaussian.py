@@ -326,7 +326,6 @@ def _mass_beyond_edges(height: FloatArray, start: FloatArray, end: FloatArray) -
 
 @cache
 def _half_legendre_rule(n_nodes: int) -> tuple[FloatArray, FloatArray]:
-    """Return the positive half of the Gauss-Legendre rule on (-1, 1): nodes and weights."""
     require(n_nodes >= 2 and n_nodes % 2 == 0, "n_nodes", n_nodes, "an even number, 2 or more")
     node, weight = np.polynomial.legendre.leggauss(n_nodes)
     return node[n_nodes // 2 :], weight[n_nodes // 2 :]
@@ -499,7 +498,6 @@ def _tangent_of_quarter_arcsine(y: FloatArray) -> FloatArray:
 
 @cache
 def _hermite_rule(n_nodes: int) -> tuple[FloatArray, FloatArray]:
-    """Return Gauss-Hermite nodes and weights for the mean over a standard normal."""
     node, weight = np.polynomial.hermite_e.hermegauss(n_nodes)
     return node, weight / weight.sum()
 

@@ -314,5 +314,4 @@ class BrickMachine:
             self.limits.record_present_count(joint, motor.last_counts - self._zeros[joint])
 
     def _require_allowed_move(self, joint: int, here: int, to: int) -> None:
-        """Raise ReachError if the limits, in counts from home, refuse a move between values of a motor's counter."""
         self.limits.require_allowed_move(joint, here - self._zeros[joint], to - self._zeros[joint])

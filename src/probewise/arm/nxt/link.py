@@ -241,6 +241,5 @@ class SerialPort:
 
 
 def _system_message(error: Exception) -> str:
-    """Return the system's message, without pyserial's additions."""
     number = getattr(error, "errno", None)
     return os.strerror(number) if number else str(error)

@@ -156,7 +156,6 @@ class Motor:
 
     @property
     def _checked_target(self) -> int:
-        """The firmware's target, in rotation counts; MotorError if it is unknown."""
         if self._target is None:
             raise MotorError(f"motor {self.letter}: its counters jumped; did a program start on the brick?")
         return self._target
@@ -181,7 +180,6 @@ class Motor:
         return self._move(back, here, behind + side * self._coast_counts(self.drive.fast_power, back), behind)
 
     def _move(self, side: Side, here: int, fast_target: int, slow_target: int) -> int:
-        """Make a fast move if it is long enough, else a slow one; return the count at rest."""
         least = max(side * here, side * self._checked_target) + 1  # a target behind this position causes no motion
         if side * fast_target > least + self.drive.lead_counts:
             return self._make_limited_move(fast_target, side, self.drive.fast_power, here)

@@ -183,14 +183,12 @@ def _beyond_in(ax: Axes, side: int) -> float:
 
 
 def _axis_room_in(axis: Axis, side: int) -> float:
-    """Return the width (`side` 0) or height (1) of an axis's ticks, of their labels and of its own."""
     ticks = max((_size_in(text)[side] for text in axis.get_majorticklabels()), default=0.0)
     label = _size_in(axis.label)[side]
     return (ticks + _TICK_IN if ticks else 0.0) + (label + _PAD_IN if label else 0.0) + _PAD_IN
 
 
 def _legend_height_in(legend: Legend | None) -> float:
-    """Return the height of a legend above axes, or below all of them; 0 for another."""
     if legend is None or legend not in _COLUMNS:
         return 0.0
     heights = np.array([_size_in(text)[1] + 0.5 * SMALL_PT / 72 for text in legend.get_texts()])
@@ -218,7 +216,6 @@ def _width_in(text: str, size_pt: float = SMALL_PT) -> float:
 
 @cache
 def _letter_em(letter: str) -> float:
-    """Return the width of a letter of the default font, in units of the font's size."""
     font = get_font(findfont(FontProperties()))
     font.set_size(10, 72)
     return font.load_char(ord(letter)).linearHoriAdvance / 655360

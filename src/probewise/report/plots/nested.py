@@ -184,7 +184,6 @@ def _checked_parameter_columns(result: Samples, parameters: Sequence[str] | None
 
 
 def _parameter_label(name: str) -> str:
-    """Return a parameter's axis label: its name, its unit in brackets."""
     unit = unit_of_name(name)
     return words_without_unit(name) + (f" ({unit})" if unit else "")
 

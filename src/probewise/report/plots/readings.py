@@ -73,7 +73,6 @@ def _track_label(plan: Plan, rows: IntArray) -> str:
 
 
 def _along_label(tracks: Sequence[Track], side: str = "") -> str:
-    """Return the label of the axis of positions: distance from the edge if all tracks cross one."""
     return _ALONG_EDGE.format(side) if all(t.from_edge for t in tracks) else _ALONG_SCAN
 
 

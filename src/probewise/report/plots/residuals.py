@@ -194,7 +194,6 @@ def recorded_against_predicted(
 
 
 def _draw_dots(ax: Axes, x: FloatArray, y: FloatArray, colour: str, label: str) -> None:
-    """Draw dots, smaller and paler if there are many."""
     ok = np.isfinite(x) & np.isfinite(y)
     n = max(int(ok.sum()), 1)
     size, alpha = float(np.clip(4000 / n, 4, 16)), 0.35 if n > _CROWDED else 0.7

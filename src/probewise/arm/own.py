@@ -109,10 +109,7 @@ class OwnInstrument:
         except Exception as failure:
             if error is None:
                 raise
-            warn(
-                f"the instrument may not be at rest: {message_of(failure, kind=False)}",
-                RuntimeWarning,
-            )
+            warn(f"the instrument may not be at rest: {message_of(failure, kind=False)}", RuntimeWarning)
 
     @property
     def turns(self) -> bool:

@@ -82,11 +82,7 @@ def choose_pixel_mm(theta: FloatArray, n_gaussians: int, *, step_mm: float) -> f
 
 
 def posterior_mean_ssf_field(
-    theta: FloatArray,
-    n_gaussians: int,
-    *,
-    pixel_mm: float = 1.0,
-    weight: FloatArray | None = None,
+    theta: FloatArray, n_gaussians: int, *, pixel_mm: float = 1.0, weight: FloatArray | None = None
 ) -> SSFField:
     """Average the SSF fields of weighted samples on square pixels, centred on multiples of their width.
 

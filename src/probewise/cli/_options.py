@@ -295,11 +295,7 @@ def _explore(to: argparse.ArgumentParser) -> None:
         "which-shape of several is there"
     )
     add(to, "--utility NAME", about)
-    add(
-        to,
-        "--learn-sensor",
-        "infer the SSF's size and place and both levels too, with the sensor as their prior",
-    )
+    add(to, "--learn-sensor", "infer the SSF's size and place and both levels too, with the sensor as their prior")
     about = (
         "prior probability that the sensor model leaves nothing out; below 1 what it leaves out is inferred too ("
         "default 0.9; 1 with --model naive, --method paper, --learn-sensor, another --utility, or several shapes)"

@@ -21,14 +21,7 @@ from probewise.cli._common import progress_of, say
 from probewise.cli._executor import worker_pool
 from probewise.cli._options import parse_finite_numbers
 from probewise.diagnosis import Diagnosis, generators_of_diagnosis
-from probewise.experiment import (
-    Exploration,
-    HiddenShape,
-    ModelName,
-    arm_over,
-    experiment_for,
-    run_from_place,
-)
+from probewise.experiment import Exploration, HiddenShape, ModelName, arm_over, experiment_for, run_from_place
 from probewise.inquiry import ReadingEntropy
 from probewise.progress import Progress
 from probewise.recordings import read_recording, shipped

@@ -20,13 +20,7 @@ import numpy as np
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.errors import DoubtfulResultWarning, NotConvergedError
 from probewise.experiment.kinds import KindProblem, PosteriorByKind, n_samples_of_kind
-from probewise.inquiry.smc import (
-    BRIEF,
-    LocalKernels,
-    Particles,
-    nested_sampling_from_scratch,
-    particles_from_posterior,
-)
+from probewise.inquiry.smc import BRIEF, LocalKernels, Particles, nested_sampling_from_scratch, particles_from_posterior
 from probewise.nested import Weighted
 from probewise.nested.importance import evenly_weighted, weighted_draws
 from probewise.priors import Prior

@@ -142,11 +142,7 @@ def with_arm_error(
 
 
 def target_reached_and_chance_off(
-    experiment: Experiment,
-    posterior: Weighted,
-    *,
-    theta: FloatArray | None = None,
-    arm_sd: FloatArray | float = 0.0,
+    experiment: Experiment, posterior: Weighted, *, theta: FloatArray | None = None, arm_sd: FloatArray | float = 0.0
 ) -> tuple[bool, float]:
     """Return whether a posterior meets the stopping rule, and its `probability_of_length_off`.
 

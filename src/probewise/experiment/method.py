@@ -12,12 +12,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError
 from probewise.experiment.evidence import can_suspend_mask, sleeping_mask, to_first_order, with_evidence_from_prior
-from probewise.experiment.kinds import (
-    IMPROBABLE,
-    SUSPECTED_PROBABILITY,
-    PosteriorByKind,
-    n_samples_of_kind,
-)
+from probewise.experiment.kinds import IMPROBABLE, SUSPECTED_PROBABILITY, PosteriorByKind, n_samples_of_kind
 from probewise.experiment.paper import N_LIVE, N_STEPS
 from probewise.experiment.rivals import Pace
 from probewise.inquiry.smc import (

@@ -99,16 +99,7 @@ _LEAST_PARTICLES = 100
 _MOST_LIFTED = 10.0
 """Largest factor between reading height and calibrated height, either way."""
 
-_SETTINGS_OF_RUN = (
-    "batch",
-    "stop_sd_mm",
-    "stop_probability",
-    "doubt_p",
-    "trust",
-    "n_particles",
-    "n_samples",
-    "n_live",
-)
+_SETTINGS_OF_RUN = ("batch", "stop_sd_mm", "stop_probability", "doubt_p", "trust", "n_particles", "n_samples", "n_live")
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,15 +19,7 @@ from probewise.calibration.sensor_file import require_fitted_sensor
 from probewise.errors import ParameterError, did_you_mean, printable, require
 from probewise.experiment.journal import value_digest
 from probewise.recordings import Disc, Instrumentation, Polygon, Uniform
-from probewise.scene import (
-    SHAPES,
-    AnyOf,
-    Card,
-    EllipseRegion,
-    Field,
-    Shape,
-    outlines,
-)
+from probewise.scene import SHAPES, AnyOf, Card, EllipseRegion, Field, Shape, outlines
 from probewise.scene.shapes import require_shape
 from probewise.world import Concealed, CoveredSurface, Oval, Reader, Spot, Surface, World
 

@@ -51,11 +51,7 @@ def log_volumes(n_at_death: IntArray, log_start: float = 0.0) -> FloatArray:
 
 
 def integrate(
-    log_likelihood: FloatArray,
-    n_at_death: IntArray,
-    *,
-    rng: np.random.Generator,
-    log_start: float = 0.0,
+    log_likelihood: FloatArray, n_at_death: IntArray, *, rng: np.random.Generator, log_start: float = 0.0
 ) -> Evidence:
     """Estimate the evidence: sum the likelihood over the shells of prior volume between successive deaths.
 

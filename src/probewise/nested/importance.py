@@ -325,13 +325,7 @@ Posterior: TypeAlias = NestedResult | Weighted
 
 
 @own_arithmetic
-def refine(
-    result: Posterior,
-    problem: Samplable,
-    *,
-    rng: np.random.Generator,
-    n_draws: int = 5000,
-) -> Weighted:
+def refine(result: Posterior, problem: Samplable, *, rng: np.random.Generator, n_draws: int = 5000) -> Weighted:
     """Reduce the error of a run's evidence and posterior by importance sampling; see `Weighted.sound` before its use.
 
     Two forms of proposal density are fitted to two thirds of the run's posterior samples. In each pilot round a few

@@ -424,11 +424,7 @@ def _place_caption(diagnosis: Diagnosis, place: Place, *, seen: bool = True) -> 
 
 
 def output_of(
-    value: Diagnosis,
-    *,
-    seed: int | None = None,
-    rng: np.random.Generator | None = None,
-    source: str = "",
+    value: Diagnosis, *, seed: int | None = None, rng: np.random.Generator | None = None, source: str = ""
 ) -> Output:
     """Return the files of a diagnosis: diagnosis.json, both models, the next readings; its figures and page.
 

@@ -33,18 +33,10 @@ _LEAST = 1e-3  # probability from which on a kind of hypotheses counts
 
 @dataclass(frozen=True, eq=False)
 class ArmError:
-    """Effect of an error in the arm's geometry, common to all readings, on the posterior of the shape.
+    """Effect of an error in the arm's geometry, common to all readings, on the posterior of the shape."""
 
-    Attributes
-    ----------
-    slopes
-        Shift of the posterior mean by each independent error of one sd, (n_params, n_errors).
-    shifts
-        Shift of each posterior sample by an error of the arm drawn for it, (n_samples, n_params); 0 for another shape.
-    """
-
-    slopes: FloatArray
-    shifts: FloatArray
+    slopes: FloatArray  # shift of the posterior mean by each independent error of one sd, (n_params, n_errors)
+    shifts: FloatArray  # of each posterior sample by an error drawn for it, (n_samples, n_params); 0 for another shape
 
     @property
     def sd(self) -> FloatArray:

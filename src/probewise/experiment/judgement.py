@@ -41,39 +41,21 @@ _ON_SHAPE = 5.0  # noise sds from the background at which a reading counts as on
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """What a posterior says of the shape, and whether it explains the readings.
+    """What a posterior says of the shape, and whether it explains the readings."""
 
-    Attributes
-    ----------
-    mean, sd
-        Posterior means and sds of the shape's parameters, each (n_params,). For a set of shapes: given the most
-        probable shape, with NaN for parameters of other shapes.
-    shapes
-        Probability of each shape of a set, by its name (empty for a single shape).
-    target_reached
-        Whether the stopping rule is met (`is_target_reached`), with the arm's error.
-    chance_off
-        Probability that a length is off by three times the sd of the stopping rule.
-    p_value
-        p-value of the best hypothesis: upper tail of chi-square with one degree of freedom per reading (conservative).
-        None where the most probable noise is not the declared one, of which this test is.
-    notes
-        Warnings.
-    unexplained
-        The trend of the best hypothesis's residuals, in words; "" if they show none.
-    arm_error
-        Effect of the arm's own error; None far from the end of a run, or if that error is not known.
-    """
-
+    # Of the shape's parameters, (n_params,). For a set of shapes: given the most probable shape, with NaN for
+    # parameters of other shapes.
     mean: FloatArray
     sd: FloatArray
-    shapes: Mapping[str, float]
-    target_reached: bool
-    chance_off: float
+    shapes: Mapping[str, float]  # probability of each shape of a set, by its name (empty for a single shape)
+    target_reached: bool  # whether the stopping rule is met (`is_target_reached`), with the arm's error
+    chance_off: float  # probability that a length is off by three times the sd of the stopping rule
+    # p-value of the best hypothesis: upper tail of chi-square with one degree of freedom per reading (conservative).
+    # None where the most probable noise is not the declared one, of which this test is.
     p_value: float | None
-    notes: tuple[str, ...]
-    unexplained: str = ""
-    arm_error: ArmError | None = None
+    notes: tuple[str, ...]  # warnings
+    unexplained: str = ""  # the trend of the best hypothesis's residuals, in words; "" if they show none
+    arm_error: ArmError | None = None  # None far from the end of a run, or if the arm's own error is not known
 
 
 def judge(
@@ -355,19 +337,12 @@ def stop_reason(
 
 @dataclass(frozen=True)
 class ReadingsLowerBound:
-    """Lower bound on the mean number of readings, for search and refinement separately.
+    """Lower bound on the mean number of readings, for search and refinement separately."""
 
-    Attributes
-    ----------
-    search_bits, refinement_bits
-        Bits needed until the first reading on the shape, and from there to the target.
-    search_capacity_bits, capacity_bits
-        Capacity of one reading: before the shape is found, that of a yes or no with the largest possible probability of
-        yes; afterwards, that of the sensor.
-    """
-
-    search_bits: float
-    refinement_bits: float
+    search_bits: float  # needed until the first reading on the shape
+    refinement_bits: float  # needed from there to the target
+    # Capacity of one reading: before the shape is found, that of a yes or no with the largest possible probability of
+    # yes; afterwards, that of the sensor.
     search_capacity_bits: float
     capacity_bits: float
 

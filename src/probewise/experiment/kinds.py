@@ -75,29 +75,15 @@ class KindProblem(SensorProblem):
 
 @dataclass(frozen=True, eq=False)
 class HypothesisKind:
-    """A shape together with at most one left-out effect; its samples and evidence are in `PosteriorByKind.particles`.
+    """A shape with at most one left-out effect; its samples and evidence are in `PosteriorByKind.particles`."""
 
-    Attributes
-    ----------
-    member
-        The shape, one of a set or the single one.
-    left_out
-        Name of the effect that the sensor model leaves out; "" if none.
-    log_prior
-        Natural log of the kind's prior probability.
-    prior, model, likelihood
-        Prior, sensor model and likelihood of the parameters of shape and effect.
-    effect
-        The effect left out, if it acts on the noise-free reading; its parameters are the last ones.
-    """
-
-    member: _MemberShape
-    left_out: str
-    log_prior: float
-    prior: Prior
+    member: _MemberShape  # the shape, one of a set or the single one
+    left_out: str  # name of the effect that the sensor model leaves out; "" if none
+    log_prior: float  # natural log of the kind's prior probability
+    prior: Prior  # this, model and likelihood are of the parameters of shape and effect
     model: SensorModel
     likelihood: Likelihood
-    effect: Effect | None = None
+    effect: Effect | None = None  # the one left out, if it acts on the noise-free reading; its parameters are the last
 
     @property
     def shape(self) -> str:

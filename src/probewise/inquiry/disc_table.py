@@ -55,26 +55,14 @@ _SHOWS = 1e-4  # share of the footprint on a card from which the card counts
 
 @dataclass(frozen=True, eq=False)
 class DiscTable:
-    """A sensor model over one disc, as a table: parameters x_mm, y_mm, radius_mm.
+    """A sensor model over one disc, as a table: parameters x_mm, y_mm, radius_mm."""
 
-    Attributes
-    ----------
-    dark, bright
-        Readings far outside and far inside.
-    margin_mm
-        Distance from the edge within which the level differs from `dark` or `bright`.
-    bend_per_mm
-        Least and greatest 1 / radius of the table.
-    levels
-        Noise-free readings, (n_bends, n_directions + 1, n_distances): evenly spaced in 1 / radius, in a pseudo-angle of
-        the direction (0 to 4, rising with the angle; the last repeats the first), and in distance from -margin to
-        margin.
-    """
-
-    dark: float
+    dark: float  # readings far outside and far inside
     bright: float
-    margin_mm: float
-    bend_per_mm: tuple[float, float]
+    margin_mm: float  # distance from the edge within which the level differs from `dark` or `bright`
+    bend_per_mm: tuple[float, float]  # least and greatest 1 / radius of the table
+    # Noise-free readings, (n_bends, n_directions + 1, n_distances): evenly spaced in 1 / radius, in a pseudo-angle of
+    # the direction (0 to 4, rising with the angle; the last repeats the first), and in distance from -margin to margin.
     levels: FloatArray
 
     @classmethod

@@ -100,39 +100,22 @@ LIGHT = UpdateSettings(1.2, 40, 0.3, 12)
 
 @dataclass(frozen=True, eq=False)
 class Particles:
-    """Weighted samples, with diagnostics of their evidence.
+    """Weighted samples, with diagnostics of their evidence since the last independent start."""
 
-    Attributes
-    ----------
-    weighted
-        The samples with the evidence.
-    ancestor
-        Index of each sample's ancestor at the last independent start, (n,).
-    start_variance
-        Variance of the log evidence at that start; 0 for draws from the prior.
-    n_resampled
-        Number of resampling steps since that start.
-    strained
-        Whether, since that start, no sample predicted some reading, or the samples could not be moved: the evidence may
-        be wrong by more than the genealogy indicates.
-    hurried
-        Whether, since that start, a reading needed four temperatures or more: then few samples were near the new
-        posterior, and the product of mean weights is nearly always too small.
-    lost_log_z
-        Upper bound on the log evidence of a mode that the samples lack: at the last search of the prior it had less
-        than one sample, and it may have given every reading since exactly. Infinite if there was no search.
-    suspended
-        Whether the samples are those of fewer readings, and the evidence an upper bound: see `suspended_with`.
-    """
-
-    weighted: Weighted
-    ancestor: IntArray
-    start_variance: float = 0.0
-    n_resampled: int = 0
+    weighted: Weighted  # the samples with the evidence
+    ancestor: IntArray  # index of each sample's ancestor at that start, (n,)
+    start_variance: float = 0.0  # variance of the log evidence at that start; 0 for draws from the prior
+    n_resampled: int = 0  # number of resampling steps
+    # No sample predicted some reading, or the samples could not be moved: the evidence may be wrong by more than the
+    # genealogy indicates.
     strained: bool = False
+    # A reading needed four temperatures or more: then few samples were near the new posterior, and the product of mean
+    # weights is nearly always too small.
     hurried: bool = False
+    # Upper bound on the log evidence of a mode that the samples lack: at the last search of the prior it had less than
+    # one sample, and it may have given every reading since exactly. Infinite if there was no search.
     lost_log_z: float = math.inf
-    suspended: bool = False
+    suspended: bool = False  # the samples are those of fewer readings, the evidence an upper bound: `suspended_with`
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "ancestor", frozen_int(self.ancestor))

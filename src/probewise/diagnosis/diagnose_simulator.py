@@ -657,9 +657,12 @@ def notes_on_simulator(apparatus: SimulatorApparatus, noise_sd: FloatArray | Non
             "and count as impossible; their intervals may be too narrow; set a shorter max_step_s, or write simulate "
             "with an integrator of your own"
         )
-    what, n_failed = ("rates", done.n_failed) if caller is None else ("simulate", caller.n_failed)
-    if n_failed:
-        yield f"{what} raised an error for {n_failed:,} parameter vectors, which count as impossible"
+    what, n_failed, n_odd = "rates", done.n_failed, 0
+    if caller is not None:
+        what, n_failed, n_odd = "simulate", caller.n_failed, caller.n_not_finite
+    for did, n in (("raised an error", n_failed), ("gave readings that are not finite", n_odd)):
+        if n:
+            yield f"{what} {did} for {n:,} parameter vectors, which count as impossible"
     if caller is not None and caller.interpolated:
         yield (
             f"simulate takes no array of {', '.join(sorted(caller.interpolated))}: each reading is interpolated "

@@ -78,7 +78,7 @@ MOST_CALLS = 10_000
 
 @dataclass(eq=False)
 class Caller:
-    """Caller of a user's `simulate` for many samples; it counts the calls, and the samples that fail.
+    """Caller of a user's `simulate` for many samples; it counts the calls, and the samples that fail or are not finite.
 
     The function `broadcasts` if it takes parameters (n_samples, 1) with columns (n_points,); else it is called for one
     sample at a time, and takes the parameters `by_row` as arrays (n_points,). `cut_short` is set if work was skipped
@@ -91,6 +91,7 @@ class Caller:
     by_row: frozenset[str] = frozenset()
     n_calls: int = 0
     n_failed: int = 0
+    n_not_finite: int = 0
     interpolated: set[str] = field(default_factory=set)
     cut_short: bool = False
     on_call: Callable[[], None] | None = None
@@ -175,6 +176,7 @@ class Caller:
                             called = self._cached_call(fixed, table, n_points)
                             readings = called if share is None else readings + share * called
                         out[k] = readings
+                        self.n_not_finite += not np.isfinite(out[k]).all()
                     except (ShapeError, KeyboardInterrupt):
                         raise
                     except Exception as error:
@@ -201,7 +203,9 @@ class Caller:
                 p, u = (take_samples(values, slice(low, high)) for values in (parameters, columns))
                 parts.append(self._call_all(p, u, (high - low, n_points), strict=False))
             return np.concatenate(parts)
-        return _readings_broadcast_to_shape(readings, shape)
+        readings = _readings_broadcast_to_shape(readings, shape)
+        self.n_not_finite += int(np.count_nonzero(~np.isfinite(readings).all(axis=1)))
+        return readings
 
     def _takes_changed_columns_together(self, parameters: Values, columns: Columns) -> bool:
         """Return whether samples may be simulated together if some columns, (n_samples, n_points), differ among them.

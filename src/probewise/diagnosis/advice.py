@@ -89,7 +89,6 @@ def nats_against(
     return nats
 
 
-ALIAS_COSINE = 0.9
 LAMBDA = 8.0  # size of an effect at which it is detected for certain, and at which a plan is judged
 
 LEAST_SHARE = 0.05
@@ -144,7 +143,7 @@ def aliases_with_separating_plans(searched: Searched, problem: Linearised, found
         bases[name] = _projected_basis(problem, problem.whiten(templates.columns[best]))[0]
     for pair in itertools.combinations((name for name, basis in bases.items() if basis.size), 2):
         cosines = np.linalg.svd(bases[pair[0]].T @ bases[pair[1]], compute_uv=False)
-        if cosines[0] >= ALIAS_COSINE:
+        if cosines[0] >= 0.9:
             pairs.append(Alias(pair, float(min(cosines[0], 1.0)), prepared.apparatus.words.settles_nothing, 0))
     pairs.sort(key=lambda alias: -alias.cosine)
     return pairs_with_separating_scans(pairs, problem, found, chosen, prepared.usable_rows, prepared.apparatus)
@@ -229,8 +228,6 @@ def _collinear(problem: Linearised, *changes: _Change) -> list[_Change]:
 
 _STRIDES = (2, 4)
 _WORTHWHILE = 0.03  # least share of the entropy that a further scan must remove
-_ANYTHING = 1e-6  # the same for the first scan
-NO_NAME = "what has no name"
 _NEAR = 0.05  # of a setting's range: how near a planned reading is to a recorded one that it repeats
 
 
@@ -331,7 +328,7 @@ def measurement_separating_rivals(
             together = np.concatenate([taken, rows[k]])
             if k not in chosen and len(together) <= MOST_ADVISED_READINGS:
                 gains[k] = mutual_information_lower_bound(of_readings(together), weights) - told
-        gains[~(gains >= (_WORTHWHILE if chosen else _ANYTHING) * uncertain)] = 0.0  # also for a model that fails there
+        gains[~(gains >= (_WORTHWHILE if chosen else 1e-6) * uncertain)] = 0.0  # also for a model that fails there
         best = int(np.argmax(gains / [option.minutes for option in offered]))
         if gains[best] == 0.0:
             break
@@ -388,7 +385,7 @@ def measurement_at_place(
         candidates[best].description,
         candidates[best].minutes,
         float(nats[best]),
-        (_null_in_words(apparatus), NO_NAME),
+        (_null_in_words(apparatus), "what has no name"),
         ((), UNKNOWN),
         nats[best] * (1 - np.eye(2)),
     )

@@ -188,7 +188,6 @@ _READING_GUIDE = (
     "(fine: detected, and told from every other effect. aliased (X c): detected, but X can imitate it, with a cosine",
     " of c; the reverse need not hold. invisible: not detected.)",
 )
-_AS_CALIBRATED = "the sensor as calibrated"
 _ABSORBED = "the model's own parameters absorb it"
 _NOISE = 0.01  # noise as a share of the span between the levels, likewise
 # Two Gaussians, a core and a faint halo, off-centre and not round, so that no effect is invisible by symmetry.
@@ -375,7 +374,7 @@ def _expected_sensor(plan: Plan, sensor: SensorPrior | None, effects: Mapping[st
     """Return a sensor as calibrated, or a typical one, with its noise sd."""
     null: CalibratedSensor
     if sensor is not None:
-        null, said = sensor_from_samples(sensor), _AS_CALIBRATED
+        null, said = sensor_from_samples(sensor), "the sensor as calibrated"
         mean = np.asarray(sensor.samples, dtype=np.float64).mean(axis=0)
         low, high = sorted(float(mean[list(sensor.names).index(name)]) for name in ("I_min", "I_max"))
         high, z = high if low < high else low + 1e-9 * (abs(low) or 1.0), np.zeros(null.n_params)
@@ -517,9 +516,7 @@ def _effects_json(effects: Sequence[EffectAudit]) -> list[dict[str, Any]]:
     ]
 
 
-_SETTINGS_OF_TABLE = 64  # of an effect's bank
 _MOST_ROWS = 1200  # rows used
-_GOLDEN = (math.sqrt(5) - 1) / 2
 
 
 @own_arithmetic
@@ -562,11 +559,11 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     assumed = f"{simulator.source or 'the simulator'} at {where}, noise {sd:.3g} {simulator.unit} ({noise})"
     assumed += f"; gaps of {join_lists([*filled])} are interpolated" if filled else ""
     expected = Expected(cast(Null, system), z, sd, lambda _: built, assumed)
-    bank = expected.bank(cast(Plan, own), most=_SETTINGS_OF_TABLE)
+    bank = expected.bank(cast(Plan, own), most=64)
     rows = np.arange(len(own))
     if len(own) > _MOST_ROWS:  # one in each of as many stretches; by the golden ratio, so that no column keeps step
         stretch = np.arange(_MOST_ROWS)
-        rows = np.asarray((stretch + stretch * _GOLDEN % 1.0) * len(own) / _MOST_ROWS, dtype=np.int64)
+        rows = np.asarray((stretch + stretch * ((math.sqrt(5) - 1) / 2) % 1.0) * len(own) / _MOST_ROWS, dtype=np.int64)
     each = math.sqrt(len(own) / len(rows))  # every row taken stands for several, with as much information as they have
     bank = replace(bank, slopes=each * bank.slopes[rows], columns=each * bank.columns[rows])
     found, cosines = audits_and_cosines(bank, list(names), simulator.unit)

@@ -44,17 +44,12 @@ from probewise.systems.system import STANDS_STILL, with_converged_step
 _COARSE = 0.1, 1e-2, 1e-3  # steps of a coordinate where smaller ones change nothing
 _STEPS_TRIED = 8  # from each start
 _BEST_STARTS = 3  # of which it goes on
-_BEGINNINGS = 0.25, 0.5  # shares of the longest run that are fitted before all of it
-_CLEARLY = 0.5  # nats of evidence by which another fit is better
 _SCREENED, _DESCENTS = 2000, 200  # points of the prior that are predicted, and the best of them, that are followed
 _STAGES = (12, 40), (18, 12), (50, 6), (120, 6)  # steps of all, and the number of the best that go on
 _POLISH, _POLISH_FEW = 400, 25  # steps with central differences, where they cost little, and else
 _STILL = 1e-11  # nats
 _EVENLY_HIGH = 1e-5  # nats
-_SAME_PLACE = 1e-4  # of a coordinate
 _DIFFERENCE = 1e-6  # of a coordinate
-_LONGEST = 0.3  # of a coordinate's range, of a step
-_STILL_FOR = 8  # steps
 _ROUNDING = 1e-15
 
 
@@ -120,7 +115,7 @@ def _fit_from_best_starts(system: System, recording: Recording, law: NoiseLaw) -
     best = tried[0]
     if system.first is None and _broadcasts(system):
         for found in fit_each_start(model, recording, list(modes_of(system, recording, law, best.z)[0]), law):
-            if log_evidence_of(found, law) > log_evidence_of(best, law) + _CLEARLY:
+            if log_evidence_of(found, law) > log_evidence_of(best, law) + 0.5:  # nats
                 best = found
     return best
 
@@ -141,7 +136,7 @@ def _starts_from_partial_runs(model: Model, recording: Recording) -> list[FloatA
         return []
     since = time_since_start_of_run(table)
     starts = list(system.starts)
-    for share in _BEGINNINGS:
+    for share in (0.25, 0.5):
         begun = since <= share * since.max()
         part = recording.with_readings(np.where(begun, recording.readings, np.nan))
         if (part.usable & ~part.censored).sum() < system.least_readings:
@@ -188,7 +183,7 @@ def modes_of(system: System, recording: Recording, law: NoiseLaw, found: FloatAr
     even = heights <= heights.min() + _EVENLY_HIGH + rounding
     out: list[int] = []
     for k in np.lexsort((np.where(even, np.sum(z**2, axis=1), heights), ~even)).tolist():
-        if all(np.abs(x[k] - x[j]).max() > _SAME_PLACE for j in out):
+        if all(np.abs(x[k] - x[j]).max() > 1e-4 for j in out):
             out.append(k)
     return z[out], int(even[out].sum())
 
@@ -250,7 +245,7 @@ class _Descent:
         now = self._look(x, central=central)
         eye, of_prior = np.eye(x.shape[1]), np.where(self.flat, 0.0, 1.0)
         for _ in range(n_steps):
-            go = np.flatnonzero(n_still < _STILL_FOR)
+            go = np.flatnonzero(n_still < 8)  # steps
             if not go.size:
                 break
             residuals, slopes, variance, height = (values[go] for values in now)
@@ -262,7 +257,7 @@ class _Descent:
             curvature = np.where(held[:, :, None] | held[:, None], eye, curvature / scale[:, :, None] / scale[:, None])
             damped = curvature + (damping[go, None, None] + _ROUNDING) * eye
             step = np.linalg.solve(damped, np.where(held, 0.0, downhill / scale)[:, :, None])[:, :, 0] / scale
-            longest = _LONGEST * (self.high - self.low)
+            longest = 0.3 * (self.high - self.low)
             to = np.clip(at + np.clip(step, -longest, longest), self.low, self.high)
             then = self._look(to, central=central)
             with np.errstate(invalid="ignore"):
@@ -347,7 +342,7 @@ def _note_on_gaps_without_runs(simulator: Simulator, table: RunTable) -> tuple[s
     if simulator.law is None or table.run is not None or not table.has_varying_time:
         return ()
     gaps = np.diff(table.time_s)
-    long = np.flatnonzero(gaps > _LONG_GAP * np.median(gaps[gaps > 0]))
+    long = np.flatnonzero(gaps > 20 * np.median(gaps[gaps > 0]))
     if gaps[long].sum() <= 0.5 * gaps.sum():
         return ()
     at = table.row_name(int(long[0]))
@@ -379,10 +374,6 @@ def _without_copies_of_reading(simulator: Simulator, table: RunTable) -> RunTabl
                 System.of(simulator, less)
                 table = replace(less, notes=(*less.notes, f"column {name} left out: {SAYS_THE_SAME}"))
     return table
-
-
-_LONG_GAP = 20.0  # median gaps
-_MOST_WITHOUT_COLUMN = 0.1  # of the readings: the rest tells the noise nearly as well
 
 
 def without_unpredictable_readings(system: System, recording: RunRecording, *, every_row: bool = False) -> RunRecording:
@@ -420,7 +411,7 @@ def without_unpredictable_readings(system: System, recording: RunRecording, *, e
     recording = replace(recording, plan=cast(Plan, table.with_columns(filled)))
     for name in filled if every_row else ():
         beside = recording.usable & ~lost & ~np.isfinite(inputs[name])
-        if 0 < beside.sum() <= _MOST_WITHOUT_COLUMN * recording.usable.sum():
+        if 0 < beside.sum() <= 0.1 * recording.usable.sum():
             readings = count_with_noun(int(beside.sum()), "reading")
             recording = _without_readings(recording, beside, f"{readings} left out: column {name!r} is missing there")
         elif beside.any():
@@ -550,8 +541,8 @@ def diagnose_system(
     step, stiff = needed
     assert simulator.law is not None
     progress(f"once more, with integration steps of {step:.3g} {simulator.time_unit}, which the repaired law needs")
-    # Finer steps cost more, and move evidences by a few nats: a second search of everything is not needed.
-    sought = frozenset(n for h in diagnosis.hypotheses if h.probability > _SOUGHT_AGAIN for n in h.effects)
+    # Finer steps cost more, and move evidences by a few nats: hypotheses nine nats behind need no second search.
+    sought = frozenset(n for h in diagnosis.hypotheses if h.probability > 1e-4 for n in h.effects)
     return diagnosed(replace(simulator, law=replace(simulator.law, max_step_s=step)), stiff=stiff, sought=sought)
 
 
@@ -671,10 +662,6 @@ def notes_on_simulator(apparatus: SimulatorApparatus, noise_sd: FloatArray | Non
         )
 
 
-_SOUGHT_AGAIN = 1e-4  # probability of a hypothesis, nine nats behind, whose effects are searched again with finer steps
-_N_HALVED = 4  # posterior samples of the repaired law for which the step is halved
-
-
 def finer_step_for_repair(diagnosis: Diagnosis) -> tuple[float, bool] | None:
     """Return the finer integration step that the repaired law needs, or the finest within reach, and if it is stiff.
 
@@ -687,7 +674,7 @@ def finer_step_for_repair(diagnosis: Diagnosis) -> tuple[float, bool] | None:
         return None
     tolerance = STANDS_STILL * float(np.median(model.noise_sd))
     try:
-        theta = model.theta[:_N_HALVED]
+        theta = model.theta[:4]
         still = with_converged_step(system, table, theta, effects, tolerance=tolerance, or_finest=True)
     except ParameterError:  # a friction or a bound that no step meets exactly
         return None

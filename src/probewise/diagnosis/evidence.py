@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import log_ndtr, logsumexp
 
 from probewise._arrays import ROUNDING, TINY, BoolArray, FloatArray, IntArray
-from probewise.diagnosis.fit import Fit, fit, log_multiplicity, residual_degrees_of_freedom, with_prior
+from probewise.diagnosis.fit import Fit, fit, residual_degrees_of_freedom, with_prior
 from probewise.diagnosis.noise import (
     LEAST_SCALE,
     NoiseLaw,
@@ -151,7 +151,9 @@ def log_evidence_under(found: Fit, laws: Sequence[NoiseLaw], sd_prior: SdPrior |
         tailed.setdefault((laws[node].whitening_key, laws[node].flat > 0), []).append(node)
     for nodes in tailed.values():
         weigh(nodes, _tailed_log_evidences)
-    out += np.array([law.log_extra for law in laws]) + log_multiplicity(found.model.sensor)
+    out += np.array([law.log_extra for law in laws])
+    if found.model.sensor.has_exchangeable_gaussians:  # whose permutations are modes of equal height
+        out += math.lgamma(found.model.sensor.n_gaussians + 1)
     if sd_prior is not None:
         out += sd_prior.log_density(peak)
     out[np.isnan(out)] = -math.inf  # slopes or residuals whose squares overflow: impossible

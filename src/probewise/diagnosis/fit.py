@@ -123,11 +123,6 @@ class Null(Protocol):
         """Build the model of a plan's readings, with effects; `n_nodes` for curved edges, as in `sensor.Chain`."""
 
 
-def log_multiplicity(null: Null) -> float:
-    """Return log N! for N exchangeable Gaussians, whose permutations are modes of equal height; otherwise 0."""
-    return math.lgamma(null.n_gaussians + 1) if null.has_exchangeable_gaussians else 0.0
-
-
 def effect_values(effect: Effect, z: FloatArray) -> FloatArray:
     """Map standard-normal coordinates to values of the effect's own parameters, (n_samples, n_params) both."""
     return effect.prior.from_unit_cube(ndtr(z))
@@ -142,7 +137,6 @@ DIFFERENCE = 1e-5  # step of a coordinate for forward differences: predictions a
 AT_ONCE = 300_000  # predictions per batch, to fit a processor's cache
 _AS_EXPECTED = 0.5  # of the gain to second order, from which a step without damping is taken without trying others
 _FARTHEST_CHANGE = 1e6  # in largest predictions: beyond it squares overflow, and a law without the effect has run away
-_IMPOSSIBLE_CHANGE = 1e3  # least change, in noise sds, of a row whose reading is impossible without the effect
 _VALLEY_DAMPINGS = np.array([1.0, 3.0, 10.0, 30.0, 100.0])  # times the curvature along the valley
 _DAMPINGS = np.array([0.0, 0.05, 0.7, 10.0, 200.0])
 
@@ -273,7 +267,7 @@ class Fit:
         farthest = _FARTHEST_CHANGE * (float(np.abs(self.predicted).max(initial=0.0)) + self.sd)
         possible = np.isfinite(change)
         change = np.clip(change, -farthest, farthest)
-        largest = np.abs(change[possible]).max(initial=_IMPOSSIBLE_CHANGE * self.sd)
+        largest = np.abs(change[possible]).max(initial=1e3 * self.sd)
         return np.asarray(np.where(possible, change, largest))
 
 

@@ -91,7 +91,6 @@ def fitted_system_from_samples(
     )
 
 
-_LEAST_ERROR = 1e-3  # of the log evidence
 _N_LIVE = 200
 _MOST_SAMPLES = 2000  # equally weighted, where many predictions cost little; else as few as a diagnosis has
 _MISSED = 4.0  # nats by which all samples are less likely than the best fit, beyond the mean loss
@@ -240,7 +239,7 @@ def fit_simulator(
     sd = np.sqrt(predicted.var(axis=0) + np.mean(noise_sd**2) * recording.relative_sd**2)
     fitted = fitted_system_from_samples(about, samples, recording, mean)
     fitted = replace(fitted, best=tuple(system.theta(modes[:1])[0].tolist()))
-    evidence = Evidence(draws.log_z, max(draws.log_z_error, _LEAST_ERROR), "importance sampling")
+    evidence = Evidence(draws.log_z, max(draws.log_z_error, 1e-3), "importance sampling")
     beside = _nested(problem, z, rng=rng, progress=progress) if thorough else None
     if system.caller is not None:
         system.caller.on_call = None

@@ -160,11 +160,8 @@ def rows_of_distinct_scans(plan: Plan) -> list[IntArray]:
     return list(seen.values())[:_MOST_SCANS]
 
 
-_FLAT_ROWS = 20  # readings over a uniform surface
 _FOOTPRINT = 1 / 14  # prior width of the footprint, as a share of a scan's length
-_ASIDE = 0.3  # displacement of an edge, as a share of a scan's length
 _LEAST_CROSSED = 0.3  # least share of a scan's length that must go across an edge
-_STRIPES = (5, 10)  # numbers of stripes per scan
 _STRIDE = 4
 
 
@@ -179,7 +176,7 @@ def target_swaps(plan: Plan) -> list[Candidate]:
         return []
     first, out = scans[0], []
     for colour, albedo in (("white", 1.0), ("black", 0.0)):
-        flat = rows_as_next_scan(plan, first[:: max(len(first) // _FLAT_ROWS, 1)], f"{colour}_next")
+        flat = rows_as_next_scan(plan, first[:: max(len(first) // 20, 1)], f"{colour}_next")
         flat = _with_pattern(flat, f"plain_{colour}", Uniform(albedo))
         out.append(candidate_scan(_LAY, f"scan a plain {colour} surface", flat))
     name = plan.scan_names[int(plan.scan[first[0]])]
@@ -206,7 +203,7 @@ def _scans_over_moved_targets(plan: Plan, scan: IntArray, edge: HalfPlane) -> li
         (f"{name}_quarter", f"turn pattern {name} and its scan by 90 degrees", *_rotated_scan_and_edge(once, edge)),
     ]
     for end in (-1.0, 1.0):
-        exactly_mm = float(beyond.mean()) + end * _ASIDE * length
+        exactly_mm = float(beyond.mean()) + end * 0.3 * length
         aside_mm = float(np.round(exactly_mm)) or exactly_mm
         moved = replace(edge, offset_mm=edge.offset_mm + aside_mm)
         words = f"move pattern {name} by {aside_mm:g} mm along its normal and scan it"
@@ -216,7 +213,7 @@ def _scans_over_moved_targets(plan: Plan, scan: IntArray, edge: HalfPlane) -> li
         seen = ndtr(_distance_inside_edge_mm(whole, moved) / (_FOOTPRINT * length))
         parts = excerpts_of_scan(np.arange(len(whole)), (_STRIDE,), seen)
         laid_in_parts.append((label, words, whole, cast(Pattern, moved), parts))
-    for number in _STRIPES:
+    for number in (5, 10):
         period_mm = float(np.round(length / number)) or length / number
         stripes = Stripes(edge.normal_rad, period_mm, 0.5, 0.0, edge.inside, edge.outside)
         label, words = f"stripes_{period_mm:g}_mm", f"scan stripes {period_mm:g} mm apart in place of pattern {name}"
@@ -262,7 +259,6 @@ def _distance_inside_edge_mm(plan: Plan, edge: HalfPlane) -> FloatArray:
 
 
 _NOT_COLUMNS = frozenset({"time", "level", "edge_distance", "slope", "direction", "orientation", "scan", "place"})
-_MOST_SCANS_ALONE = 24  # number of scans above which residuals are not located in single scans
 
 
 def varying_covariates(plan: Plan, usable: IntArray, level: FloatArray, slope: FloatArray) -> list[Covariate]:
@@ -308,7 +304,7 @@ def _place_covariates_along_scans(plan: Plan, usable: IntArray) -> list[Covariat
     longest = (x_mm if along_x else y_mm)[rows]
     out = [Covariate("place", longest, rows)] if _varies(longest) else []
     for rows, name in zip(by_scan, plan.scan_names, strict=True):
-        if rows.size >= 16 and len(by_scan) <= _MOST_SCANS_ALONE:
+        if rows.size >= 16 and len(by_scan) <= 24:  # else too many
             along = x_mm[rows] if np.ptp(x_mm[rows]) >= np.ptp(y_mm[rows]) else y_mm[rows]
             if _varies(along):
                 out.append(Covariate("place", along, rows, scan=name))

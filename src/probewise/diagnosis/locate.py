@@ -47,7 +47,6 @@ LARGEST_P = 0.05
 """p-value above which nothing is significant, neither a place nor, whatever the form of the SSF, the whole."""
 
 _LEAST_ROWS = 3
-_RUNS = ("scan", "run")  # covariates that number parts of the recording
 _ABSORBED = 1e-8  # of a window's length: below it, what the fit leaves is rounding
 _SIGNIFICANT = 0.05  # of the maximum of an effect: below it, it is negligible
 _PLAIN = 0.25  # p-value of the first draws above which more draws are not needed
@@ -202,7 +201,7 @@ def significant_places(
         inside = covariate.values[windows[there[best]]]
         window: tuple[str | None, float | None, float | None] = (
             (scan_names[int(inside[0])], None, None)
-            if covariate.name in _RUNS
+            if covariate.name in ("scan", "run")  # by number
             else (covariate.scan, float(inside.min()), float(inside.max()))
         )
         curve = _mean_curve_fields(covariate, residuals)

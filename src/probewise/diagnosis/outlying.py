@@ -30,10 +30,7 @@ from probewise.sensor.stages import Stage
 
 FAR_OUT = ", far out"  # suffix of the names of families of unknown effects in which outlying readings cluster
 _BY_CHANCE = 0.05  # probability that noise alone has such a reading in a recording
-_CLUSTERED = 3.0  # nats for a share of outlying readings that depends on a covariate
-_NO_CHANCE = 1e-6  # the same, of a reading of which a note is worth while
 _BENT = 2.0  # noise sds: rms of the residuals from which single readings may have bent a fit
-_N_BLOCKS = 5
 _C_STEPS = 4
 # Share of successive readings that are equal, up to which equal ones are a sign of lost values or of a stop. Eight
 # equal readings in turn, or five and three, are then by chance in one of 1e5 places, at the end of the range in fewer.
@@ -185,7 +182,7 @@ def _least_trimmed_fit(
 ) -> Fit | None:
     """Fit all readings but the `n_most` farthest, from fits that leave out none, or one of five blocks of rows."""
     n, best, least = len(law.sd), None, math.inf
-    for block in [np.zeros(0, dtype=np.int64), *np.array_split(np.arange(n), _N_BLOCKS)]:
+    for block in [np.zeros(0, dtype=np.int64), *np.array_split(np.arange(n), 5)]:
         lost = np.isin(np.arange(n), block)
         tried = fit_each_start(model, recording, starts, replace(law, lost=lost), max_steps=_C_STEPS)
         found = min(tried, key=lambda one: one.objective)
@@ -233,13 +230,13 @@ def _cluster(far: BoolArray, readings: FloatArray, covariates: Sequence[Covariat
     if np.mean(again[~far]) < _RARELY:
         far = far & ~(again & np.append(False, far[:-1]))
     scores = clustering_log_bayes_factors(far.astype(np.float64), covariates)
-    return max(scores.values(), default=-math.inf) > _CLUSTERED
+    return max(scores.values(), default=-math.inf) > 3.0  # nats
 
 
 def note_on_improbable_rows(found: Fit, recording: Recording) -> tuple[str, ...]:
     """Say in one note which single rows carry the residuals of a fit, if readings so far out are no noise."""
     law, usable = white_noise_of_recording(recording), np.flatnonzero(recording.usable)
-    at = improbable_rows(found, law, chance=_NO_CHANCE)
+    at = improbable_rows(found, law, chance=1e-6)
     if not at.size:
         return ()
     squares = (found.residuals / law.sd) ** 2
@@ -262,7 +259,6 @@ def _percent(share: float) -> str:
     return f"{100 * share:.0f} %" if share < 0.995 else "nearly all"
 
 
-_LEAST_IN_TURN = 5  # successive readings of exactly one value
 _LEAST_IN_ALL = 8
 # Of the median change from one reading to the next: on a coarser lattice readings are equal without a stop.
 _FINE = 0.1
@@ -328,6 +324,6 @@ def find_meter_stop(recording: Recording, reading: str = "the reading") -> Meter
         elsewhere = steps[~stands[1:][in_turn]]
         follows = np.append(False, stands[:-1] & stands[1:] & in_turn)
         streaks = np.diff(np.flatnonzero(np.append(~follows, True)))  # of rows at the stop, or one elsewhere
-        if np.mean(elsewhere == 0) <= _RARELY and streaks.max() >= _LEAST_IN_TURN:
+        if np.mean(elsewhere == 0) <= _RARELY and streaks.max() >= 5:
             return MeterStop(level, is_ceiling, there, reading, recording.plan.instrumentation.unit)
     return None

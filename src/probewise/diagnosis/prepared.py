@@ -178,7 +178,6 @@ def _is_same_recording(one: Recording, other: Recording) -> bool:
 
 
 MOST_DIAGNOSED_READINGS = 2400
-_FEWEST_SCANS = 8
 _STRETCH = 6  # readings
 _SEED = 0  # the same rows of the same recording, whatever the seed of its diagnosis
 
@@ -196,7 +195,7 @@ def rows_to_diagnose(recording: Recording) -> IntArray:
         return np.arange(len(recording))
     share = MOST_DIAGNOSED_READINGS / n_usable
     n_kept = math.floor(n_scans * share)
-    if n_kept >= _FEWEST_SCANS:
+    if n_kept >= 8:
         # One of each n_scans / n_kept, with the first and the last: scans that go there and back must not all go there.
         jitter = np.random.default_rng(_SEED).random(n_kept)
         kept = np.floor((np.arange(n_kept) + jitter) * n_scans / n_kept).astype(np.int64)
@@ -225,9 +224,6 @@ def positions_in_stretches(run: IntArray, most: int) -> IntArray:
     begin, end = np.searchsorted(run[by_run], own, side="left"), np.searchsorted(run[by_run], own, side="right")
     first = np.where(end - begin >= _STRETCH, np.clip(first, begin, end - _STRETCH), first)
     return np.unique(by_run[first[:, None] + np.arange(_STRETCH)])
-
-
-_WILD = 5.0  # spans of the middle 80 % of the readings from their median: no scale of a prior
 
 
 @dataclass(frozen=True, eq=False)
@@ -338,7 +334,7 @@ def _lost_readings(recording: Recording, null: Null | None, apparatus: Apparatus
     if np.abs(np.diff(readings[usable], 2)).max() <= LARGEST_SIZE * rough:
         return None
     low, middle, high = np.quantile(readings[usable], [0.1, 0.5, 0.9])
-    wild = np.flatnonzero(recording.usable & (np.abs(readings - middle) > _WILD * (high - low)))
+    wild = np.flatnonzero(recording.usable & (np.abs(readings - middle) > 5.0 * (high - low)))  # no scale of a prior
     if null is None:
         kept = replace(recording, left_out=(*recording.left_out, *wild.tolist()))
         null = default_sensor(Extent.of(kept), 1)

@@ -279,8 +279,6 @@ def _with_more_gaussians(theta: FloatArray, n_gaussians: int, wanted: int) -> Fl
     return np.concatenate([blocks.reshape(len(theta), 6 * wanted), theta[:, 6 * n_gaussians :]], axis=1)
 
 
-_LEAST_OF_AN_ORDER = 0.2  # probability below which an SSF order is left out of the average
-_LEAST_OF_A_RIVAL = 0.02  # probability below which a hypothesis is left out of the average
 _MOST = 6  # hypotheses in one model
 _DOUBT_BESIDE = 0.5  # weight of the null for a named effect with an unknown effect beside it
 
@@ -324,7 +322,7 @@ class HypothesisSamples:
         kept = [(best, probabilities[best.names])]
         rivals = [names for names in probabilities if names != best.names]  # no set: equal ones keep their order
         for names in sorted(rivals, key=lambda names: -probabilities[names]):
-            if probabilities[names] < _LEAST_OF_A_RIVAL or len(kept) == _MOST:
+            if probabilities[names] < 0.02 or len(kept) == _MOST:
                 break
             rival = max(self._candidates_of_same_form(best, names), key=lambda c: c.evidence[self.noise].log_z)
             if all(can_share_one_model(c.found.model.effects, rival.found.model.effects) for c, _ in kept):
@@ -338,12 +336,12 @@ class HypothesisSamples:
         return mix([part for part, _ in parts], np.array([share for _, share in parts]), null, plan, rng=self.rng)
 
     def _orders(self, candidate: WeighedFit) -> list[tuple[WeighedFit, float]]:
-        """List the fits of a candidate's hypothesis with probable numbers of Gaussians, and the share of each."""
+        """List a hypothesis's fits with a number of Gaussians whose probability is above 0.2, and the share of each."""
         alike = self._candidates_of_same_form(candidate, candidate.names)
         noises = [c.possible_noise(self.noise) for c in alike]
         log_z = np.array([c.evidence[noise].log_z for c, noise in zip(alike, noises, strict=True)])
         shares = np.exp(log_z - logsumexp(log_z))
-        kept = (shares > _LEAST_OF_AN_ORDER) & np.array([noise == noises[int(np.argmax(log_z))] for noise in noises])
+        kept = (shares > 0.2) & np.array([noise == noises[int(np.argmax(log_z))] for noise in noises])
         return [(alike[k], float(shares[k] / shares[kept].sum())) for k in np.flatnonzero(kept)]
 
     def _candidates_of_same_form(self, best: WeighedFit, names: Names) -> list[WeighedFit]:

@@ -196,19 +196,15 @@ def default_sensor(extent: Extent, n_gaussians: int) -> CalibratedSensor:
     return CalibratedSensor(n_gaussians, center, np.diag(sd))
 
 
-_SHARE = 0.1  # prior sd of each weight, as a share of the mass
-
-
 def with_free_form(one: CalibratedSensor) -> CalibratedSensor:
     """Return a sensor of free form: the place and size of one Gaussian, and weights of sd 0.1 of the mass about 0."""
-    factor = np.diag(np.concatenate([np.zeros(one.n_params), np.full(N_BENDS, _SHARE)]))
+    factor = np.diag(np.concatenate([np.zeros(one.n_params), np.full(N_BENDS, 0.1)]))
     factor[: one.n_params, : one.n_params] = one.factor
     center = np.concatenate([one.center, np.zeros(N_BENDS)])
     return CalibratedSensor(N_FREE_FORM, center, factor, has_exchangeable_gaussians=False, is_free_form=True)
 
 
 _RIDGE = 1e-8  # of each variance, by which a covariance of samples is sure to be positive
-_LEAST_VARIANCE = 1e-16  # of a coordinate, relative to its size
 
 
 class SensorPrior(Protocol):
@@ -271,7 +267,7 @@ def sensor_from_samples(sensor: SensorPrior) -> CalibratedSensor:
     # Coordinates that are the same in all samples have a variance too, in the readings' unit where they are levels.
     size, levels = np.ones(len(center)), slice(5, 7) if free else slice(-2, None)
     size[levels] = np.abs(center[levels]).max() or 1.0
-    floor = _RIDGE * np.maximum(np.diag(natural_cov), _LEAST_VARIANCE * size**2)
+    floor = _RIDGE * np.maximum(np.diag(natural_cov), 1e-16 * size**2)
     factor = np.linalg.cholesky(natural_cov + np.diag(floor))
     return CalibratedSensor(n_gaussians, center, factor, False, free, height_mm, sd_prior)
 

@@ -24,11 +24,11 @@ from probewise.systems.forms import (
     bind_forms,
     bind_proposals,
     has_value_per_run,
+    jumps_at_row,
     names_in_definitions,
-    names_of_jumps_in_sorted_rows,
 )
 from probewise.systems.forms.modulations import time_since_start_of_run
-from probewise.systems.table import append_tables, covariate_of_column, unused_name
+from probewise.systems.table import covariate_of_column, unused_name
 
 _LEAST_ROWS = 4
 _MOST_RUNS = 4  # recorded runs to start from
@@ -45,7 +45,6 @@ _SPELT = {
 _MINUTES = {unit: minutes for minutes, units in _SPELT.items() for unit in units.split()}
 _A_READING = 1 / 60  # minutes, where no time tells how long one takes
 _BREAK = 0.5  # minutes, before a run
-_RUN = "run"
 
 
 def candidate_runs(table: RunTable, simulator: Simulator) -> list[Candidate]:
@@ -56,7 +55,7 @@ def candidate_runs(table: RunTable, simulator: Simulator) -> list[Candidate]:
     each of several runs, such as a start, may have to be: only a control that varies in a recorded run does so again,
     or any control of a law's only run.
     """
-    out, run = list[Candidate](), table.run or unused_name(_RUN, table.columns)
+    out, run = list[Candidate](), table.run or unused_name("run", table.columns)
     reading, settable = simulator.reading, [name for name in simulator.controls if name in table.covariates]
     ends = {k: (float(np.nanmin(table.covariates[k])), float(np.nanmax(table.covariates[k]))) for k in settable}
     varies = {name for name in settable for rows in table.rows_by_scan() if np.ptp(table.covariates[name][rows]) > 0}
@@ -155,10 +154,6 @@ ON_NOISE: tuple[LightEffect, ...] = (
 )  # fmt: skip
 _ALONG_ROWS = (noise.correlated_noise, noise.random_walk, noise.drifting_noise)
 CALLS_OF_A_SEARCH = 8_000  # with what judging and sampling ask beyond it, some 10,000 in a diagnosis
-# Of a law's rates, 15 to 20 microseconds each, of however many samples: about the same number of predictions of a long
-# table as of a short one.
-_EVALUATIONS_PER_ROW = 6_000
-_LEAST_EVALUATIONS = 1_500_000
 _MOST_MULTIPLIED = 10  # factors of products, time included: 45 products; more would dilute the prior of each
 
 # Of a term in a rate that is another state by definition, such as that of a position; of a jump at a row of a table
@@ -241,7 +236,8 @@ class SimulatorApparatus(Apparatus):
     @property
     def evaluations_of_a_search(self) -> int:
         """Limit on the evaluations of a law's rates, of all samples and runs at once, in a search."""
-        return max(_EVALUATIONS_PER_ROW * len(self.about.table), _LEAST_EVALUATIONS)
+        # At 15 to 20 microseconds each: about as many predictions of a long table as of a short one.
+        return max(6_000 * len(self.about.table), 1_500_000)
 
     def refit_budget_share_spent(self) -> float:
         caller = self.system.caller
@@ -259,10 +255,11 @@ class SimulatorApparatus(Apparatus):
 
     def prior_odds(self, effects: Mapping[str, Effect]) -> PriorOdds:
         curves = {f"curve:{name.removeprefix('input_gain:')}" for name in effects if name.startswith("input_gain:")}
+        jumps = {name for name, form in effects.items() if jumps_at_row(form) and form.covariates[0] != "row"}
         return replace(
             PriorOdds.for_effects(effects),
             twice=TWICE,
-            unlikely=names_in_definitions(self.about, effects) | names_of_jumps_in_sorted_rows(effects) | curves,
+            unlikely=names_in_definitions(self.about, effects) | jumps | curves,
             unlikely_weight=_UNLIKELY,
         )
 
@@ -340,8 +337,10 @@ class SimulatorApparatus(Apparatus):
         return candidate_runs(cast(RunTable, plan), self.system.simulator)
 
     def plan_of_alternatives(self, candidates: Sequence[Candidate], after: Plan) -> Plan:
-        first, *more = (cast(RunTable, candidate.plan) for candidate in candidates)
-        return cast(Plan, append_tables(first, more))
+        tables = [cast(RunTable, candidate.plan) for candidate in candidates]
+        columns = {name: np.concatenate([table.columns[name] for table in tables]) for name in tables[0].columns}
+        like = {name: other for table in tables for name, other in table.like.items()}
+        return cast(Plan, replace(tables[0], columns=columns, like=like))
 
     def plan_of_sequence(self, candidates: Sequence[Candidate], after: Plan) -> Plan:
         recorded, out = cast(RunTable, after), list[Candidate]()

@@ -27,10 +27,7 @@ from probewise.effects.effect import LEAST_VISIBLE
 from probewise.effects.reference import scan_indicator
 from probewise.sensor import Stage
 
-_INVISIBLE = -50.0  # log Bayes factor of a template that the fit absorbs entirely
-_MOST_AT_ONCE = 2**19  # numbers of templates that are multiplied together, for a processor's cache
 _MOST_REMEMBERED = 2**25  # numbers of templates that are remembered: those of a few hundred rows about every fit
-_MOST_PASSING = 2**22  # numbers of templates that are not remembered
 _FEW_KINDS = 16  # of readings, by their precision: ends and gaps of scans make a handful; other noise, one a reading
 
 
@@ -87,7 +84,7 @@ class TemplateBank:
         out = list[IntArray]()
         for width in dict.fromkeys(self.widths.tolist()):
             members = np.flatnonzero(self.widths == width)
-            at_once = max(_MOST_AT_ONCE // (max(len(self.templates[0]), 1) * width), 1)
+            at_once = max(2**19 // (max(len(self.templates[0]), 1) * width), 1)
             out += np.split(members, range(at_once, len(members), at_once))
         return out
 
@@ -237,7 +234,7 @@ def _log_bayes_factors_of_grams(grams: FloatArray, along: FloatArray, total: Flo
         np.log1p(-np.minimum(of_all, 1 - LAST_DIGITS), out=terms[k])
         terms[k] *= -0.5 * n_kept
         terms[k] -= 0.5 * np.log1p(ratio).sum(axis=1)[:, None]
-    terms[~visible] = _INVISIBLE
+    terms[~visible] = -50.0  # the fit absorbs such a template entirely
     top = terms.max(axis=0)
     n_visible = np.maximum(np.count_nonzero(visible, axis=0), 1)[:, None]
     return np.asarray(top + np.log(np.exp(terms - top).sum(axis=0) / n_visible))
@@ -305,7 +302,7 @@ class TemplateCache:
             own = templates_of_effect(found, effect.with_fewer_variants(), self.usable)
             each[effect.name] = own.columns
             n_numbers += own.n_numbers
-            if n_numbers > _MOST_PASSING or effect is effects[-1]:
+            if n_numbers > 2**22 or effect is effects[-1]:
                 yield TemplateBank.by_name(each)
                 each, n_numbers = {}, 0
 
@@ -400,9 +397,6 @@ def _predicted_changes(found: Fit, effect: Effect, bank: FloatArray, usable: Int
     return np.split(change.T, len(bank), axis=1)
 
 
-_BEST_ENTRIES = 2  # best entries of each effect's bank, for pairs
-
-
 def log_mean_exp(scores: FloatArray) -> float:
     """Return the log of the mean of Bayes factors that are given as logs."""
     top = float(scores.max())  # thousands of short lists: scipy's general function is ten times slower
@@ -420,7 +414,7 @@ def log_bayes_factors_of_pairs(
     pairs = list(combinations(sorted(singles), 2))
     if not pairs:
         return {}
-    best = {name: np.argsort(-scores)[:_BEST_ENTRIES].tolist() for name, scores in singles.items()}
+    best = {name: np.argsort(-scores)[:2].tolist() for name, scores in singles.items()}
     entries = [(name, i) for name in singles for i in best[name]]
     columns = [templates[name][i] for name, i in entries]
     widths = np.array([c.shape[1] for c in columns])

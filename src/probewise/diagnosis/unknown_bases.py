@@ -29,10 +29,8 @@ _LIKE = 0.9  # cosine from which a basis duplicates a named effect
 _ROUNDING = 1e-13  # of a template's squares: a direction of which the fit leaves no more is absorbed
 _MOST_GROUPS = 24
 _N_STEPS = 15  # change points of a covariate
-_FEW_SCANS = 6
 _MEMORIES = (3.0, 10.0, 30.0)  # readings
 _TERMS = (3, 8, 20)  # of smooth functions; of a gain or a displacement the first two
-_TERMS_IN_TIME = (3, 8, 24, 64)  # where a wave may be of any frequency
 _WINDOWS = (4, 8, 16)  # parts of a covariate
 
 
@@ -79,7 +77,9 @@ def bank_of_unknown_effects(
         for template in _bases_of_covariate(covariate, ways):
             whole = template.shape[1] > 1 or covariate.name == "slope"
             found.append((name if whole else f"{name}, locally", template))
-    found += [(PRODUCTS, template) for template in _product_bases(multiplied, len(signal))]
+    scaled = [(c, (c.values - c.values.mean()) / (c.values.std() or 1.0)) for c in multiplied]
+    factors = [_on_all_rows(values[:, None], c, len(signal)) for c, values in scaled]
+    found += [(PRODUCTS, first * second) for first, second in combinations(factors, 2)]
     if scan is not None:
         found += [(MEMORY, template[back]) for template in _memory_bases(signal[order], starts)]
         found += [(SCAN_ENDS, template[back]) for template in _scan_end_bases(len(signal), starts)]
@@ -142,7 +142,7 @@ def _bases_of_covariate(covariate: Covariate, ways: _BasisMultipliers) -> Iterat
     elif covariate.scan is not None:
         yield _cosine_bases(covariate, ways.adds, 6)
         yield _cosine_bases(covariate, ways.shift, 3)
-        yield from _window_bases(covariate, ways.adds, _WINDOWS if ways.n_scans <= _FEW_SCANS else _WINDOWS[1:2])
+        yield from _window_bases(covariate, ways.adds, _WINDOWS if ways.n_scans <= 6 else _WINDOWS[1:2])
     elif covariate.name == "place":
         yield from _smooth_bases(covariate, _TERMS, ways.adds, ways.shift)
         yield from _smooth_bases(covariate, _TERMS[:2], ways.gain)
@@ -151,7 +151,7 @@ def _bases_of_covariate(covariate: Covariate, ways: _BasisMultipliers) -> Iterat
         yield from _step_bases(covariate, ways.shift)
         yield from _window_bases(covariate, ways.adds, _WINDOWS)
     elif covariate.name == "time":
-        yield from _smooth_bases(covariate, _TERMS_IN_TIME, ways.adds)
+        yield from _smooth_bases(covariate, (3, 8, 24, 64), ways.adds)  # a wave may be of any frequency
         for way in (ways.gain, ways.shift):
             yield from _smooth_bases(covariate, _TERMS[:2], way)
             yield from _step_bases(covariate, way)
@@ -185,13 +185,6 @@ def _group_bases(covariate: Covariate, ways: _BasisMultipliers) -> Iterator[Floa
         yield member * way[:, None]
     for way in (ways.adds, ways.shift):
         yield from (column[:, None] * way[:, None] for column in member.T)
-
-
-def _product_bases(covariates: Sequence[Covariate], n_points: int) -> Iterator[FloatArray]:
-    scaled = [
-        _on_all_rows(((c.values - c.values.mean()) / (c.values.std() or 1.0))[:, None], c, n_points) for c in covariates
-    ]
-    yield from (first * second for first, second in combinations(scaled, 2))
 
 
 def _memory_bases(signal: FloatArray, starts: IntArray) -> Iterator[FloatArray]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -196,13 +197,6 @@ def table_of(columns: Columns[T], rows: Iterable[T], *, caption: str = "") -> Ma
     return table(tuple(columns), (tuple(cell(row) for cell in columns.values()) for row in rows), caption=caption)
 
 
-_COLUMNS = ("reached", "mean", "median", "to_white", "after_white", "bits_each", "held", "arm_s")
-_INTERVALS = (
-    "Readings that a run needs. The 95 % interval of the share is Wilson's, for the number of runs beside it; that of "
-    f"the median lies between two of the runs, and takes {LEAST_FOR_MEDIAN} of them."
-)
-
-
 def study_page(results: Mapping[study.Trial, Result], *, command: str) -> CampaignPage:
     """Return what a study comes to; `command` is the command line that made it."""
     found, own, first = study.summaries(results), study.trials_by_row(results), next(iter(results))
@@ -221,8 +215,12 @@ def study_page(results: Mapping[study.Trial, Result], *, command: str) -> Campai
             f"Readings until every length is known to 4 mm, of at most {first.max_readings}; a miss counts as that "
             "many.",
         )
+        needs = (
+            "Readings that a run needs. The 95 % interval of the share is Wilson's, for the number of runs beside it; "
+            f"that of the median lies between two of the runs, and takes {LEAST_FOR_MEDIAN} of them."
+        )
         both = (
-            table_of(_READINGS, found.items(), caption=_INTERVALS),
+            table_of(_READINGS, found.items(), caption=needs),
             table_of(_WORTH, found.items(), caption="Information per reading, errors of the runs, and cost."),
         )
         sections = [Section("The table", (fragment(*both), paragraph(_STUDY_LEGEND)))]
@@ -321,13 +319,14 @@ def lower_bound_table(found: Mapping[study.SearchConfiguration, study.Summary]) 
 
 def study_csv(table: Mapping[study.SearchConfiguration, study.Summary]) -> str:
     """Return a study's table as CSV text: estimates with bounds; processor times, which vary, are left out."""
+    estimates = ("reached", "mean", "median", "to_white", "after_white", "bits_each", "held", "arm_s")
     ends, others = ("value", "low", "high"), ("error_mm", "wrong", "wrong_expected", "wrong_limit")
     rows = []
     for row, found in table.items():
-        values = [getattr(getattr(found, name), end) for name in _COLUMNS for end in ends]
+        values = [getattr(getattr(found, name), end) for name in estimates for end in ends]
         values += [getattr(found, name) for name in others]
         rows.append([row.name, found.n_runs, *map(_csv_cell, values)])
-    bounds = [f"{name}{end}" for name in _COLUMNS for end in ("", "_low", "_high")]
+    bounds = [f"{name}{end}" for name in estimates for end in ("", "_low", "_high")]
     return csv_text_of_rows(["row", "runs", *bounds, *others], rows)
 
 
@@ -495,10 +494,8 @@ def _effect_table(done: tables.Results) -> Markup:
 
 def _case_table(results: tables.Results) -> Markup:
     gained = "held-out gain, and that of the right model (nats)"
-    return table(
-        ("case", "system", "concealed", "lambda", "said", "probability", "right", gained),
-        (_case_cells(number, result) for number, result in enumerate(results)),
-    )
+    headers = ("case", "system", "concealed", "lambda", "said", "probability", "right", gained)
+    return table(headers, itertools.starmap(_case_cells, enumerate(results)))
 
 
 def _case_cells(number: int, result: Result) -> tuple[str, ...]:

@@ -64,10 +64,12 @@ class NullRefit:
         extent, noise = Extent.of(clean), NoiseModel((), clean, least_sd=_NOISE_SD)
         sensor = default_sensor(extent, 1)
         starts = starts_of_one_gaussian(sensor)
-        found = min((_white_noise_fit(Model(sensor, (), clean.plan), clean, z) for z in starts), key=_objective)
+        found = min(
+            (_white_noise_fit(Model(sensor, (), clean.plan), clean, z) for z in starts), key=lambda one: one.objective
+        )
         best, best_log_z = found, laplace_evidence(found, noise).log_z
         for _ in range(_MOST_GAUSSIANS - 1):
-            found = min(_fits_with_one_more_gaussian(found, clean, extent), key=_objective)
+            found = min(_fits_with_one_more_gaussian(found, clean, extent), key=lambda one: one.objective)
             log_z = laplace_evidence(found, noise).log_z
             if log_z > best_log_z:
                 best, best_log_z = found, log_z
@@ -75,10 +77,6 @@ class NullRefit:
                 break
         self._kept = clean, best
         return best
-
-
-def _objective(found: Fit) -> float:
-    return found.objective
 
 
 def _fits_with_one_more_gaussian(found: Fit, recording: Recording, extent: Extent) -> Iterator[Fit]:

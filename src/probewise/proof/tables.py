@@ -265,9 +265,6 @@ def confusion_counts(
     return truths, columns, np.array([[counts[t, s] for s in columns] for t in truths]).reshape(len(truths), -1)
 
 
-_DRAWS = 400
-_HELD = 0.95
-
 Hidden = Mapping[str, Any]
 
 
@@ -293,12 +290,12 @@ def oracle_credible_set_size(hidden: Hidden) -> float:
     d: FloatArray = np.array(list(apart.values()))
     right = np.array([True, *(name in right_names(hidden) for name in apart)])
     rng = np.random.default_rng(len(d))
-    log_odds = np.zeros((_DRAWS, len(d) + 1))
-    log_odds[:, 1:] = -(d**2) / 2 - d * rng.standard_normal((_DRAWS, len(d)))
+    log_odds = np.zeros((400, len(d) + 1))
+    log_odds[:, 1:] = -(d**2) / 2 - d * rng.standard_normal((400, len(d)))
     odds = np.exp(log_odds - log_odds.max(axis=1, keepdims=True))
     order = np.argsort(-odds, axis=1)
     shares = np.take_along_axis(odds, order, axis=1) / odds.sum(axis=1, keepdims=True)
-    inside = np.cumsum(shares, axis=1) - shares < _HELD
+    inside = np.cumsum(shares, axis=1) - shares < 0.95
     n_right = np.sum(inside & right[order], axis=1)
     return float(np.mean(inside.sum(axis=1) - np.maximum(n_right - 1, 0)))
 
@@ -326,9 +323,7 @@ Decision: TypeAlias = Literal["met", "missed", "open"]
 
 _GAUSSIAN = ("gaussian", "two_lobes")  # SSFs that are mixtures of Gaussians
 _ALPHA, _STRICT = 0.05, 0.01  # p-values that are rejected
-_MOST_NATS = 100.0  # cap on a recording's held-out gain
 _LEAST_NATS = 3.0  # least gain of the right model for a share of it to be meaningful
-_AS_GOOD = 0.8  # share of the true law's held-out gain that counts as equally good
 
 
 @dataclass(frozen=True)
@@ -601,7 +596,7 @@ def gains_on_held_out_runs(result: Result) -> tuple[float, float] | None:
     """
     if not _have_densities(result, "null", "repaired", "right"):
         return None
-    return min(_held_out_gain(result, "repaired"), _MOST_NATS), min(_held_out_gain(result, "right"), _MOST_NATS)
+    return min(_held_out_gain(result, "repaired"), 100.0), min(_held_out_gain(result, "right"), 100.0)
 
 
 def _held_out_runs(done: list[Result]) -> Iterator[ScoreRow]:
@@ -629,7 +624,7 @@ def _gains_as_much_as_true_law(result: Result) -> bool:
     if names_match(names, right_names_of_each_effect(result, merged=True)) and result["verdict"] != "unknown":
         return True
     gains = gains_on_held_out_runs(result)
-    return gains is not None and gains[1] >= _LEAST_NATS and gains[0] >= _AS_GOOD * gains[1]
+    return gains is not None and gains[1] >= _LEAST_NATS and gains[0] >= 0.8 * gains[1]
 
 
 def score(results: Results) -> tuple[ScoreRow, ...]:

@@ -458,12 +458,6 @@ def concatenate_tables(tables: Sequence[RunTable], sources: Sequence[str]) -> tu
     return replace(first, columns=columns, run=run, notes=how), tuple(notes)
 
 
-def append_tables(table: RunTable, more: Sequence[RunTable]) -> RunTable:
-    """Append the rows of tables with the same columns to a table; runs of one name become one run."""
-    columns = {name: np.concatenate([t.columns[name] for t in (table, *more)]) for name in table.columns}
-    return replace(table, columns=columns, like={key: value for t in (table, *more) for key, value in t.like.items()})
-
-
 def _concatenated_column(
     name: str, parts: Sequence[NDArray[Any] | None], tables: Sequence[RunTable], sources: Sequence[str]
 ) -> NDArray[Any]:

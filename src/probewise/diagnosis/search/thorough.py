@@ -26,8 +26,6 @@ from probewise.errors import DoubtfulResultWarning
 from probewise.nested.importance import repartitioned
 from probewise.progress import Progress, silent
 
-A_NAT = 1.0
-
 
 @dataclass(frozen=True)
 class Weighing:
@@ -57,7 +55,7 @@ class Weighing:
     @property
     def agree(self) -> bool:
         """Whether the two log evidences differ by at most a nat plus one standard error of nested sampling."""
-        return abs(self.gap) <= A_NAT + self.error
+        return abs(self.gap) <= 1.0 + self.error
 
 
 def sentence_with_agreement(reason: str, weighings: Sequence[Weighing]) -> str:
@@ -81,7 +79,6 @@ _LEAST, _MOST = 2, 3  # hypotheses to recompute, apart from the null
 _LEAST_PROBABILITY = 0.01
 _MOST_RUNS = 4  # runs from priors near the posterior
 _N_SAMPLES = 2000  # posterior samples that define such a prior
-_SHARP = 0.3  # nats: largest error with which a difference of one nat can be resolved
 _APART = 3.3  # standard errors: one in a thousand
 
 Run = Callable[..., nested.NestedResult]
@@ -215,7 +212,7 @@ def _evidence_near_posterior(
             return sharper.log_z, sharper.log_z_error, ()
         weights = np.array([1.0 / own.log_z_error**2 for own in runs])
         error = float(weights.sum() ** -0.5)
-        if error <= _SHARP or len(runs) == _MOST_RUNS:
+        if error <= 0.3 or len(runs) == _MOST_RUNS:
             log_z = float(np.average([own.log_z for own in runs], weights=weights))
             return log_z, error, tuple(doubt for own in runs for doubt in own.warnings)
         theta = found.samples(_N_SAMPLES, rng=rng)

@@ -113,11 +113,6 @@ def _second_wave(form: Effect) -> Effect:
     return replace(again, parameters={**form.marginals, "period": shorter}, entries=entries)
 
 
-def names_of_jumps_in_sorted_rows(effects: Mapping[str, Any]) -> frozenset[str]:
-    """Return the names of jumps at a row that may be jumps along the column that sorts the rows."""
-    return frozenset(name for name, form in effects.items() if jumps_at_row(form) and form.covariates[0] != "row")
-
-
 def jumps_at_row(effect: Any) -> bool:
     """Return whether an effect has a change point that is counted in rows."""
     return isinstance(effect, StepEffect) and effect.change_points.by_row

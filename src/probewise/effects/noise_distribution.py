@@ -227,18 +227,14 @@ class PredictiveMixture:
             noise = replace(noise, step=np.full((1, 1), self.step))
         if between is not None:
             noise = replace(noise, offset_sd=np.hypot(np.broadcast_to(noise.offset_sd, mean.shape), between))
-        log_sum = np.logaddexp.reduce(self._log_density_of_scored(noise, mean), axis=0)
-        self._blocks.append((len(mean), mean.mean(axis=0), variance, limited.mean(axis=0), log_sum))
-
-    def _log_density_of_scored(self, noise: NoiseParameters, mean: FloatArray) -> FloatArray:
-        """Return the log density of each scored reading, or log probability at an end, (n_samples, n_scored)."""
         sd, offset_sd = (each if each.shape[-1] == 1 else each[:, self.scored] for each in (noise.sd, noise.offset_sd))
         given = replace(noise, sd=sd, offset_sd=offset_sd), self.readings[self.scored], mean[:, self.scored]
-        out = log_density(*given)
+        density = log_density(*given)  # (n_samples, n_scored)
         for at_end, is_high in zip(self._at_ends, (False, True), strict=True):
             if at_end[self.scored].any():
-                out = np.where(at_end[self.scored], log_probability_at_end(*given, is_high=is_high), out)
-        return out
+                density = np.where(at_end[self.scored], log_probability_at_end(*given, is_high=is_high), density)
+        log_sum = np.logaddexp.reduce(density, axis=0)
+        self._blocks.append((len(mean), mean.mean(axis=0), variance, limited.mean(axis=0), log_sum))
 
     @property
     def _at_ends(self) -> tuple[BoolArray, BoolArray]:

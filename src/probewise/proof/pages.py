@@ -427,7 +427,10 @@ def challenge_page(
             )
             sections.append(Section("Confusion matrix", (drawn,)))
             if systems:
-                sections.append(Section("Case by case", (_case_table(results),)))
+                held_out = "held-out gain, and that of the right model (nats)"
+                names = ("case", "system", "concealed", "lambda", "said", "probability", "right", held_out)
+                cases = table(names, itertools.starmap(_case_cells, enumerate(results)))
+                sections.append(Section("Case by case", (cases,)))
             else:
                 sections.append(Section("Each effect at lambda 8", (_effect_table(done),)))
         failures = [(f"{r['kind']}, {r['at']}", r["failed"]) for r in results if "failed" in r]
@@ -490,12 +493,6 @@ def _effect_table(done: tables.Results) -> Markup:
             for name, (detected, named) in tables.detected_and_named_by_effect(done).items()
         ),
     )
-
-
-def _case_table(results: tables.Results) -> Markup:
-    gained = "held-out gain, and that of the right model (nats)"
-    headers = ("case", "system", "concealed", "lambda", "said", "probability", "right", gained)
-    return table(headers, itertools.starmap(_case_cells, enumerate(results)))
 
 
 def _case_cells(number: int, result: Result) -> tuple[str, ...]:

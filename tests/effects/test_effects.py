@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from probewise.diagnosis.light_sensor import _NOT_COLUMNS
 from probewise.effects import EFFECTS, VOCABULARY, Extent, HeavyTailedPrior, LogHeavyTailedPrior
 from probewise.effects.effect import sentence_from_samples
 from probewise.effects.optics import distinct_scan_lines
@@ -57,6 +58,7 @@ def test_every_effect_keeps_the_contract(name):
     assert isinstance(effect.stage, Stage)
     assert len(effect.units) == len(names)
     assert effect.covariates
+    assert {*effect.covariates} <= {*_NOT_COLUMNS, "lattice", *PLAN.covariates}  # those along which residuals are seen
     for variant in (effect.variants()[0], effect.variants()[-1]):
         bank = variant.entries
         assert bank.ndim == 3

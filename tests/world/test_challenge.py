@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from probewise.effects import VOCABULARY
 from probewise.errors import NotConvergedError
 from probewise.proof.sensors import (
     INSIDE,
@@ -164,6 +165,8 @@ def test_every_single_and_outsider_can_be_drawn_at_its_size():
             if SAMPLERS[name].limit > SAMPLERS[name].first:
                 assert truth.hidden[0].size_lambda == pytest.approx(size, rel=0.1)
     assert not NEEDS_SENSOR & set(SINGLES)
+    since_calibration = {"dark_level", "gain", "noise_sd"}
+    assert {*VOCABULARY} - {*INSIDE} == since_calibration
 
 
 @pytest.mark.slow

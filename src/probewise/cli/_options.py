@@ -409,7 +409,7 @@ def _challenge(to: argparse.ArgumentParser) -> None:
     add(to, "--out DIR")
     about = "number of recordings, the seed's first; 60 (default) give a case of each kind, 6000 the whole table"
     add(to, "--cases N", about, type=_count, default=60)
-    about = "recordings of twelve kinds of system, each with its simulator's file, instead of a light sensor's"
+    about = "recordings of various systems, each with its simulator's file, instead of a light sensor's"
     add(to, "--systems", about)
     about = "take the readings that the diagnosis advises until it is settled, N rounds at most (1, default: none)"
     add(to, "--rounds N", about, type=_count, default=1)

@@ -4,8 +4,9 @@ The paper, section "Efficacy of Sensor Model", shows that a better likelihood ma
 finds a poor likelihood: it tests and locates residuals, explains them by named effects, repairs the model, and measures
 the gain on held-out readings.
 
-Reading order: `prepared` (the input), `fit` and `noise` (the model), `search` (evidences), `verdict`, `best_repair`,
-`samples` and `posterior` (draws), `locate`, `advice`; `diagnosis.diagnose_prepared` calls them. `apparatus` is what
+Reading order: the input (`prepared.prepare` of recordings, `diagnose_simulator.prepare_system` of a table), `fit` and
+`noise` (the model), `search` (evidences), `verdict`, `best_repair` (which may withdraw it), `samples` and `posterior`
+(draws), `locate`, `advice`; `diagnosis.diagnose_prepared` calls them. `apparatus` is what
 they ask of a light sensor (`light_sensor`) or of a simulator (`simulator_rows`).
 """
 

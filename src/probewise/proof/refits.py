@@ -170,7 +170,10 @@ _MOST_NAMES = 2
 
 
 class SystemRefit:
-    """The simulator of a drawn system, fitted by the engine to noise-free readings of its rows, from the truth."""
+    """The simulator of a drawn system, fitted by the engine to noise-free readings of its rows, from the truth.
+
+    After a fit, `model` is the model without effects and `true_z` the truth in its coordinates, (n_params,).
+    """
 
     def __init__(self) -> None:
         self._drawn: DrawnSystem | None = None
@@ -183,7 +186,7 @@ class SystemRefit:
         """Return the fit of the model without effects, or of `beside`, to readings that are not held out."""
         if self._drawn is not drawn:
             self._prepare(drawn)
-        model, z = (self.model, self._true_z) if beside is None else (beside.model, beside.z)
+        model, z = (self.model, self.true_z) if beside is None else (beside.model, beside.z)
         found = fit(model, self.recording(readings), z, self._law, tolerance=_TOLERANCE)
         if not np.isfinite(found.objective):
             raise NotConvergedError(f"a fit of the {drawn.kind.name} left the finite numbers")
@@ -213,8 +216,8 @@ class SystemRefit:
         values = {**drawn.shared, **of_runs}
         theta = np.array([[values[name] for name in system.marginals]])
         system = with_converged_step(system, table, theta, tolerance=STANDS_STILL * kind.sd)
-        self.model, self._true_z = Model(system, (), cast(Plan, table)), ndtri(system.prior.to_unit_cube(theta))[0]
-        self._error = self.model.predict(self._true_z[None, :])[0] - true.readings
+        self.model, self.true_z = Model(system, (), cast(Plan, table)), ndtri(system.prior.to_unit_cube(theta))[0]
+        self._error = self.model.predict(self.true_z[None, :])[0] - true.readings
         self._recording = recording_from_table(simulator, table)
         self._law = white_noise(len(table), least=_LEAST_SD * kind.sd)
         self._drawn, self._sd = drawn, kind.sd

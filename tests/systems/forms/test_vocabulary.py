@@ -3,9 +3,13 @@
 import numpy as np
 import pytest
 
+from probewise.diagnosis.fit import Model
 from probewise.diagnosis.words import FORMS_IN_WORDS, effect_has_words, effect_in_words
 from probewise.effects import name_without_copy_suffix
-from probewise.proof.systems.forms import ADDED_FAMILIES, FAMILIES
+from probewise.proof.refits import SystemRefit
+from probewise.proof.systems.cases import draw_system
+from probewise.proof.systems.forms import ADDED_FAMILIES, FAMILIES, SystemEffect, forms_of
+from probewise.proof.systems.kinds import BATH, OSCILLATOR
 from probewise.systems import Law, Noise, RunTable, Simulator, System
 from probewise.systems.forms import ReferenceFit, bind_forms
 
@@ -51,3 +55,30 @@ def test_the_report_has_words_for_every_form(names):
 def test_the_report_has_words_for_nothing_else(names):
     of_the_noise = {"random_walk", "noise_per_run"}
     assert set(FORMS_IN_WORDS) <= {name.split(":")[0] for name in names} | of_the_noise
+
+
+@pytest.mark.parametrize(
+    ("kind", "share"), [(BATH, 1e-4), pytest.param(OSCILLATOR, 0.15, marks=pytest.mark.slow)], ids=["formula", "law"]
+)
+def test_the_library_and_the_world_that_conceals_have_the_same_formulas(kind, share):
+    """Readings with each form, by the engine and by the world; of a law to how they integrate and delay a column."""
+    rng = np.random.default_rng(3)
+    drawn, refit = draw_system(kind, rng=rng), SystemRefit()
+    bare = drawn.true_system
+    forms = refit.forms(refit.refit(drawn, bare.readings))
+    theta = refit.model.theta(refit.true_z[None, :])
+    differ = {}
+    for form in forms_of(bare):
+        effect = SystemEffect(form, form.of_amplitude(form.first, form.draw(rng)))
+        if effect.name not in forms:  # none that could be seen
+            continue
+        wanted = refit.recording(drawn.simulate_diagnosed_rows([effect])).readings
+        found = []
+        for variant in forms[effect.name].variants():
+            values = [[effect.values.get(name, 0.0) for name in variant.prior.names]]
+            chain = Model(refit.model.sensor, (variant,), refit.model.plan).chain
+            found.append(chain.predict(np.append(theta, values, axis=1), refit.model.plan)[0])
+        change = np.abs(wanted - refit.recording(bare.readings).readings).max()
+        if (off := min(np.abs(readings - wanted).max() for readings in found)) > share * change:
+            differ[form.name] = off, change
+    assert not differ

@@ -1,4 +1,4 @@
-"""Kinds of system: simulator file, which the world reads too, and experimental design; six static, six with a law."""
+"""Kinds of system: simulator file, which the world reads too, and experimental design; static or with a law."""
 
 from __future__ import annotations
 

@@ -26,7 +26,6 @@ _PAIRS = {
     "links_mm": (("links", "upper_mm"), ("links", "lower_mm")),
     "sensor_mm": (("sensor", "forward_mm"), ("sensor", "drop_mm")),
 }
-_FITTED_PAIRS = ("axis_mm", "shoulder_mm", "links_mm")
 
 
 def shipped_geometry_path() -> Path:
@@ -99,7 +98,7 @@ def text_with_fitted_values(text: str, geometry: Geometry) -> str:
     """
     numbers: dict[tuple[str, str], float] = {
         place: length
-        for pair in _FITTED_PAIRS
+        for pair in ("axis_mm", "shoulder_mm", "links_mm")
         for place, length in zip(_PAIRS[pair], getattr(geometry, pair), strict=True)
     }
     for name, joint in zip(JOINTS, geometry.joints, strict=True):

@@ -30,7 +30,6 @@ from probewise.recordings.table import LARGEST_PLACE_MM
 
 _A_READING = 'a finite number, or a dict such as {"value": 41.5, "time_s": 12.0, "temperature_c": 21.3}'
 _OF_THE_POSE = ("x_mm", "y_mm", "orientation_rad")
-_TAKEN = (*KNOWN, SESSION)
 _RETURNED, _OR_NAN = " of what measure returned", "a finite number, or nan where it is missing"
 
 
@@ -282,7 +281,7 @@ def _number_or_nan(name: str, found: object) -> float:
 
 def _checked_covariate(name: object, number: object) -> float:
     """Return a covariate of a reading as a float, NaN if missing; ParameterError for a name that is not allowed."""
-    if name in _TAKEN:
+    if name in (*KNOWN, SESSION):
         allowed = (
             "a name that is no column of a recording; time and place are time_s, x_mm, y_mm, orientation_rad of a "
             "dict, or time_s and pose of a Reading"

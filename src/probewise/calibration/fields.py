@@ -17,7 +17,6 @@ from probewise.sensor import Footprint, SSFField, footprint_of, mean_ssf_field
 
 _SIGMAS = 5.0
 _MOST_PIXELS_A_SIDE = 301
-_SERIES = (1.0, 0.5, 0.2, 0.1)
 # The sum over pixels of width p is a trapezoidal or midpoint rule in the distance to an edge (depending on whether the
 # edge halves a pixel or lies between two): its error is at most p^2 / 12 times the greatest slope of the profile of a
 # footprint of sd s, 0.242 / s^2. With 4.5 pixels per sd that is 1.0e-3 of I_max - I_min.
@@ -78,7 +77,7 @@ def choose_pixel_mm(theta: FloatArray, n_gaussians: int, *, step_mm: float) -> f
     narrowest = np.where(f.weight >= _LEAST_SHARE, narrow, np.inf).min(axis=(1, 2))
     wanted = min(1.0, step_mm, float(np.median(narrowest)) / _PIXELS_PER_SD)
     decade = 10.0 ** math.ceil(math.log10(wanted) - 1e-9)
-    return next(s * decade for s in _SERIES if s * decade <= wanted * (1 + 1e-9))
+    return next(s * decade for s in (1.0, 0.5, 0.2, 0.1) if s * decade <= wanted * (1 + 1e-9))
 
 
 def posterior_mean_ssf_field(

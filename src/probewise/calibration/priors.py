@@ -27,7 +27,6 @@ _MAX_CORRELATION = 0.98
 _SAME_AXIS = 0.01  # chord of the doubled angle; it equals 0.3 degrees
 _TINY = float(np.finfo(float).tiny)
 _AMPLITUDE = Uniform(0.0, 1.0)
-_PER_GAUSSIAN = ("a", "u", "v", "A", "B", "C")
 
 
 @dataclass(frozen=True)
@@ -124,7 +123,7 @@ class SSFPrior:
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Parameter names in the sensor's order: a_1, u_1, v_1, A_1, B_1, C_1, ..., I_min, I_max."""
-        gaussians = (f"{p}_{n}" for n in range(1, self.n_gaussians + 1) for p in _PER_GAUSSIAN)
+        gaussians = (f"{p}_{n}" for n in range(1, self.n_gaussians + 1) for p in ("a", "u", "v", "A", "B", "C"))
         return (*gaussians, "I_min", "I_max")
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:

@@ -58,7 +58,6 @@ from probewise.scene import region_of
 
 _UNITS = "LEGO units (1 dark to 100 bright)"
 _COLUMNS = "x_mm,y_mm,orientation_deg,time_s,reading"
-_WHITE = "uniform:1"
 _HEIGHTS, _APART_MM = 9, 1.0  # at which the light is learnt, from that of reading upwards
 _STEP_OF_LIGHT = 0.1  # of a reading in all its steps, 0 to 100
 STEP_MM = 5.0
@@ -67,7 +66,6 @@ _MOST_MM = 60.0  # largest step
 _SEES_MM = 14.0  # radius of the sensor's view
 _LEAST_CONTRAST = 0.05  # least contrast of white and black, as a share of the larger
 _OFF_LEVEL = 0.35  # largest deviation from a level, as a share of the contrast; beyond any noise
-_COLOURS = {True: "white", False: "black"}
 _AROUND_MM = np.stack(
     [
         radius * np.array([math.cos(turn), math.sin(turn)])
@@ -234,7 +232,7 @@ def _compare_heights_by_light(arguments: argparse.Namespace, geometry: Geometry)
     places = places or [(width / 2, height / 2), *((x, y) for x, y in spread_mark_places(geometry).tolist())]
     require(len(places) >= 2, "X,Y", " ".join(arguments.places), "two places or more: heights are compared")
     require_within_reach(geometry, np.array(places), "place")
-    instrument, bench = _bench.open_instrument(arguments, geometry, scene=_WHITE)
+    instrument, bench = _bench.open_instrument(arguments, geometry, scene="uniform:1")
     assert isinstance(instrument, LegoArm)
     with instrument as arm:
         if bench is None:
@@ -511,7 +509,7 @@ class SheetCheck:
             return None
         self._reported.add((name, is_white))
         place = f"({self._plan.x_mm[row]:g}, {self._plan.y_mm[row]:g}) mm"
-        here, there = (_COLOURS[shade] for shade in (is_white, not is_white))
+        here, there = ("white", "black") if is_white else ("black", "white")
         wrong = f"reads {value:g}, where {there} read {np.median(other):g}"
         wrong += f" and {here} {np.median(own):g}" if own else ""
         return f"sheet {name!r} contradicts its pattern: at {place} it is {here}, and {wrong}"

@@ -31,7 +31,6 @@ from probewise.world.shipped import true_world as world_behind
 
 DIAGNOSIS = "diagnosis"  # folder of the second recording's diagnosis
 _MODELS: dict[ModelName, str] = {"naive": "naive", "ssf": "SSF"}
-_TRUSTS = {"trusting": 1.0, "doubting": 0.9}
 N_LIVE = 100  # live points of the calibration; --full uses the paper's 300
 N_LIVE_ROBOT = 100
 MAX_READINGS = 80
@@ -75,7 +74,7 @@ def _run_demo(
             return pool.submit(_search, sensor, hidden, seed, stream, max_readings=max_readings, **options)
 
         doubts: dict[str, Any] = {"saturates_at": report.SATURATION, "max_readings": MAX_READINGS_DOUBT}
-        doubting = {name: seek(7, trust=trust, **doubts) for name, trust in _TRUSTS.items()}
+        doubting = {name: seek(7, trust=trust, **doubts) for name, trust in {"trusting": 1.0, "doubting": 0.9}.items()}
         searching = {name: seek(6, model=model, utility=ReadingEntropy()) for model, name in _MODELS.items()}
         parts: list[Any] = [diagnosing, *doubting.values(), *searching.values()]
         progress(doing, 1, 6)

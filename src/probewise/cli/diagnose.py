@@ -44,7 +44,6 @@ if TYPE_CHECKING:
     from probewise.scene import Shape
 
 _INPUTS = "inputs.sha256"  # of the recording, its description, sensor and simulator, and the options
-_OF_ALL = ("table.csv", "counts.svg", PAGE)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -188,7 +187,7 @@ def _device_names(files: Sequence[Path]) -> list[str]:
     ]
     twice = next((name for name in names if names.count(name) > 1), None)
     require(twice is None, "recordings", twice, "files of different names, which name their folders")
-    taken = next((name for name in names if name in _OF_ALL or name.startswith(".")), None)
+    taken = next((name for name in names if name in ("table.csv", "counts.svg", PAGE) or name.startswith(".")), None)
     require(taken is None, "recordings", taken, "another name of that file, which names its folder")
     return names
 

@@ -57,7 +57,7 @@ from probewise.experiment.setup import Experiment
 from probewise.inquiry import bits_gained, prior_entropy
 from probewise.nested import Weighted
 from probewise.recordings.plan import Recording
-from probewise.sensor.commanded import require_possible_commands
+from probewise.sensor.commanded import height_ratio, led_state
 
 _OFF_MM = 30.0  # between the place of a reading and the one chosen for it
 _OFF_SDS, _OFF_BITS = 3.0, 2.0  # differences of posteriors; with other random numbers they are below 0.7
@@ -371,7 +371,9 @@ def _require_possible_reading(experiment: Experiment, reading: Reading, journal:
     """
     try:
         experiment.readout.require_in_range(reading.value)
-        require_possible_commands(experiment.problem([reading]).recording.plan)
+        plan = experiment.problem([reading]).recording.plan
+        led_state(plan)
+        height_ratio(plan)
     except ParameterError as error:
         if journal is not None:
             raise FileError(journal.path, f"{error.name} is {error.value}", error.allowed, row=number + 1) from error

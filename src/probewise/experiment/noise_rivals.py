@@ -25,7 +25,6 @@ from probewise.priors import LogUniform
 
 _REACH = 5.0  # noise sds beyond its range that a sensor may read
 _SHARES = LogUniform(2e-3, 0.2).from_unit((np.arange(8) + 0.5) / 8)
-_FACTORS = SD_FACTORS.from_unit((np.arange(12) + 0.5) / 12)
 _NODES = (np.arange(6)[:, None] + 0.5) / 6  # of a prior of one parameter
 _EXACT = 1e-3  # of the noise sd: within which a value counts as the same, lost to black or rounded
 _PHASES = 7
@@ -134,7 +133,7 @@ def noise_likelihoods(noise: DeclaredNoise, levels: tuple[float, float]) -> dict
 
 def _changed_sd(noise: DeclaredNoise, readings: FloatArray, predicted: FloatArray) -> FloatArray:
     """Another sd of the noise than at the calibration; a node is the factor."""
-    sds = (noise.sd * _FACTORS).tolist()
+    sds = (noise.sd * SD_FACTORS.from_unit((np.arange(12) + 0.5) / 12)).tolist()
     return _log_mean_over_nodes([noise.log_density(readings, predicted, sd=sd).sum(axis=1) for sd in sds])
 
 

@@ -57,7 +57,6 @@ _POWERS_OF_S = {"at_s": 1, "tau_s": 1, "per_hour": -1}
 _SCALE_SAYS = (
     "the arm moves {} % too far along {}, or as much too short along {}: the shape is in the arm's own lengths"
 )
-_CHANGE_POINT = LogUniform(0.5 * PACED_S_PER_READING, 100.0 * PACED_S_PER_READING)
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,7 +224,7 @@ def _prior_for_run(effect: Effect, field_mm: tuple[float, float]) -> Mapping[str
         if isinstance(marginal, HeavyTailedPrior | LogHeavyTailedPrior):
             marginals[name] = replace(marginal, smallest=_SMALLEST)
         elif name == "at_s":
-            marginals[name] = _CHANGE_POINT
+            marginals[name] = LogUniform(0.5 * PACED_S_PER_READING, 100.0 * PACED_S_PER_READING)
     return marginals
 
 

@@ -36,7 +36,6 @@ _ALLOWED_SD = (
 _PER_SD = 2.0  # levels of the predicted reading per noise sd, given a reading
 _LEAST = 1e-12
 _LEAST_SD = 1e-150  # and one over it the greatest: squares of numbers beyond overflow
-_LOG_2PI = math.log(2 * math.pi)
 _N_LEVELS = 256  # of a reading without noise: near a goal they are finer than a sample's error
 _N_SDS = 8  # groups of samples where the sd of the noise is unknown
 _CELL = 0.4  # sds: wide as a cell of a reading, which loses 1.3 % of a small information
@@ -122,7 +121,7 @@ class ReadingNoise:
         """Return the log density of readings, given predictions and sds (`scale`); arrays that broadcast."""
         z, nu = (readings - predicted) / scale, self.dof
         if math.isinf(nu):
-            standard = -0.5 * (z * z + _LOG_2PI)
+            standard = -0.5 * (z * z + math.log(2 * math.pi))
         else:
             constant = float(gammaln((nu + 1) / 2) - gammaln(nu / 2)) - 0.5 * math.log(nu * math.pi)
             standard = constant - 0.5 * (nu + 1) * np.log1p(z * z / nu)

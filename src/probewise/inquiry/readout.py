@@ -20,7 +20,6 @@ _REACH = 5.0  # noise sds beyond the levels that the cells cover
 _FINE = 0.25  # width of a cell in noise sds, for unrounded readings: loses 0.3 % of a nat
 _WIDE = 2.0  # steps: of wider noise, a mean hardly depends on the rounding of each reading
 _MOST_SUMS = 3000  # values of a sum of readings
-_LEAST = np.float32(1e-30)
 _PER_SD = 4.0  # levels per noise sd, for the capacity
 _MOST_ROUNDS = 2000
 _CLOSE_BITS = 1e-4
@@ -129,7 +128,7 @@ class Readout:
 
 def entropy_bits(probability: FloatArray) -> FloatArray:
     """Return the Shannon entropy in bits along the last axis; zero probabilities contribute 0."""
-    log = np.log2(np.maximum(probability, _LEAST))
+    log = np.log2(np.maximum(probability, np.float32(1e-30)))
     log *= probability
     return np.asarray(-log.sum(axis=-1))
 

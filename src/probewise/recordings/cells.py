@@ -16,8 +16,7 @@ from numpy.typing import ArrayLike
 from probewise._arrays import FloatArray, array_or_none
 from probewise.errors import ParameterError
 
-_WORDS = ("nan", "na", "n/a")
-_SPELT = (map("".join, itertools.product(*zip(word, word.upper(), strict=True))) for word in _WORDS)
+_SPELT = (map("".join, itertools.product(*zip(word, word.upper(), strict=True))) for word in ("nan", "na", "n/a"))
 MISSING = frozenset(itertools.chain([""], *_SPELT))
 """Texts that mark a missing number."""
 
@@ -87,12 +86,6 @@ def is_missing(cell: str) -> bool:
 def looks_like_number(cell: str) -> bool:
     """Return whether a cell holds a number, however it is written, with a unit or without."""
     return _QUANTITY.fullmatch(cell.translate(_ODD_SIGNS)) is not None
-
-
-def unit_of_cells(cells: Sequence[str]) -> str:
-    """Return the unit that stands in all cells of a column of numbers; "" if there is none."""
-    found = _Quantities.of(cells)
-    return "" if found is None else found.unit
 
 
 def plain_cells(
@@ -203,8 +196,10 @@ def looks_like_time(cell: str) -> bool:
     return any(form.fullmatch(cell) for form in (_CLOCK_ALONE, _YEAR_FIRST, _YEAR_LAST))
 
 
-def require_unit_of_time(name: str, unit: str, wanted: str) -> None:
+def require_unit_of_time(name: str, cells: Sequence[str], wanted: str) -> None:
     """Raise UnclearCellError if the cells of a column of times have another unit than is wanted."""
+    found = _Quantities.of(cells)
+    unit = "" if found is None else found.unit
     if unit and _SECONDS.get(unit.lower()) != _SECONDS.get(wanted.lower(), unit):
         raise UnclearCellError(0, f'times in {wanted}, or time_unit = "{unit}"', name=name)
 

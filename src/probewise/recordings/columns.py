@@ -24,7 +24,6 @@ SESSION = "session"
 """Name of the column of `Plan.sessions`."""
 A_SESSION = "a whole number from 0, the same throughout a scan"
 A_SCAN = "a name in every row, or in none; leave out rows without a scan"
-_LED_WORDS = {"true": "1", "false": "0"}
 
 
 class TableLike(Protocol):
@@ -44,7 +43,7 @@ def is_commanded(name: str, controls: Sequence[str]) -> bool:
 
 def led_cell(cell: str) -> str:
     """Return a cell of the column `led` with true and false, in any case, as 1 and 0."""
-    return _LED_WORDS.get(cell.lower(), cell)
+    return {"true": "1", "false": "0"}.get(cell.lower(), cell)
 
 
 def a_command(name: str) -> str:

@@ -50,7 +50,6 @@ def read_bytes(path: Path, what: str) -> bytes:
 
 
 _AS_UTF_8 = "UTF-8 text (save the file again with that encoding; from a spreadsheet program as CSV UTF-8)"
-_ZIP = b"PK\x03\x04"  # a workbook is a zip archive
 
 
 def read_text(path: Path, what: str) -> str:
@@ -59,7 +58,7 @@ def read_text(path: Path, what: str) -> str:
     Raises FileError if it is missing, cannot be read or is no such text.
     """
     content = read_bytes(path, what)
-    if content.startswith(_ZIP):
+    if content.startswith(b"PK\x03\x04"):  # a workbook is a zip archive
         raise FileError(
             path, "it is a workbook of a spreadsheet program or a zip archive", "a table saved as CSV UTF-8"
         )

@@ -32,13 +32,11 @@ from probewise.recordings.cells import (
     plain_cells,
     require_unit_of_time,
     texts_to_times,
-    unit_of_cells,
 )
 from probewise.recordings.io import LARGEST, read_text
 
 LARGEST_PLACE_MM = 1e9  # places have smaller squares than other numbers, up to `LARGEST`
 
-_BEGIN_FORMULA = ("=", "+", "-", "@")
 _ESCAPED = re.compile(r"'(?='*[=+@-])")  # see _not_as_formula
 _PLAIN = re.compile(r"[-+.0-9eE]*")
 _DASHES = frozenset({"-", "--", "---", "----"})  # words for what is missing
@@ -338,7 +336,7 @@ def _with_plain_numbers(
                 cure = "of a time of day, write date and clock into one column, 2026-11-28 12:30:00"
                 notes.append(f"{others[0]} has other days than {time}, which passes midnight where it falls: {cure}")
         elif time in odd:
-            require_unit_of_time(time, unit_of_cells(odd[time]), time_unit)
+            require_unit_of_time(time, odd[time], time_unit)
         usual = [name for name in columns if name not in odd and name not in names and name != time]
         rewritten, said = plain_cells(odd, lambda: {name: columns[name] for name in usual})
     except UnclearCellError as error:
@@ -359,7 +357,7 @@ def number_text(value: float) -> str:
 
 def _not_as_formula(cell: object) -> object:
     """Return a cell, in front of a text like "=1+1" or "'=1+1" one apostrophe more; numbers stay as they are."""
-    if isinstance(cell, str) and cell.lstrip("'")[:1] in _BEGIN_FORMULA and parsed_numbers([cell]) is None:
+    if isinstance(cell, str) and cell.lstrip("'")[:1] in ("=", "+", "-", "@") and parsed_numbers([cell]) is None:
         return f"'{cell}"
     return cell
 

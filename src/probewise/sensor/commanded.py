@@ -24,12 +24,6 @@ def has_commanded_height_or_led(plan: Plan) -> bool:
     return "led" in plan.covariates or height_ratio(plan) is not None
 
 
-def require_possible_commands(plan: Plan) -> None:
-    """Raise ParameterError for an LED's state outside 0 to 1, or a height of 0 or below where heights count."""
-    led_state(plan)
-    height_ratio(plan)
-
-
 def led_state(plan: Plan) -> FloatArray:
     """Return the LED's state at each reading, 0 to 1, (n_points,), or (1,) without a column `led`; 1 at NaN.
 

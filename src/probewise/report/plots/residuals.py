@@ -20,7 +20,6 @@ from probewise.report.plots import canvas
 from probewise.report.residual_means import ResidualMeans, groups_of_neighbours, rows_by_value
 from probewise.report.words import number_text
 
-_CHANCE = "95 % by chance alone"
 _STYLES = ((canvas.VERMILLION, "o", "-"), (canvas.BLUE, "s", (0, (4, 1.5))))
 _CROWDED = 500  # number of dots from which they are paler
 _MANY = 1500  # number of dots from which they are an image inside the SVG
@@ -71,7 +70,7 @@ def mean_residuals_along(
     if each is not None:
         _draw_dots(ax, *each, canvas.GREY, "one reading")
     ax.axhline(0, **canvas.THIN)
-    band: dict[str, Any] = {"color": canvas.GREY, "alpha": 0.3, "label": _CHANCE}
+    band: dict[str, Any] = {"color": canvas.GREY, "alpha": 0.3, "label": "95 % by chance alone"}
     if means.by_value:
         ax.errorbar(means.at, np.zeros(len(means.at)), yerr=means.chance, fmt="none", elinewidth=8, **band)
     else:

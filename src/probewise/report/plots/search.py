@@ -17,7 +17,6 @@ from probewise._words import count_with_noun
 from probewise.report.plots import canvas
 
 _NEXT_GREEN = "#00e08a"  # the palette's green, lighter, so that the next place shows on copper
-_CARD_YELLOW = "#ffd54a"
 _OUTLINE_BLUE = "#3fa7ff"  # likewise; hypotheses are blue, as in the paper
 _DARK_EDGE = "#c8c8c8"  # edge of a square whose reading was dark
 _GROUND = "#2a1a12"  # of the legend, as dark as the map at its darkest: everything on the map shows on it
@@ -78,7 +77,7 @@ def playing_field(
         ax.plot(*truth_mm.T, color="white", linewidth=1.2, linestyle=(0, (3, 5)), label="the true target")
     for n, corners in enumerate(cards_mm):
         label = "" if n else "known card"
-        ax.add_patch(Polygon(corners, fill=False, edgecolor=_CARD_YELLOW, linewidth=1.4, hatch="//", label=label))
+        ax.add_patch(Polygon(corners, fill=False, edgecolor="#ffd54a", linewidth=1.4, hatch="//", label=label))
     if places_mm is not None and readings is not None and len(places_mm):
         low, high = levels
         shade = np.clip((np.asarray(readings) - low) / max(high - low, 1e-9), 0, 1)

@@ -41,7 +41,7 @@ class LightSensor:
         """Return the AD converter's current sample, 0 to 1023."""
         number = int(self.clock() / 0.003)
         if self._sample[:2] != (number, lit):
-            # The inverse of `_normalized_light`: 0 % is 896 counts, 100 % is 200; beyond, linear within 0 to 1023.
+            # The inverse of `normalized` below: 0 % is 896 counts, 100 % is 200; beyond, linear within 0 to 1023.
             raw = round(_BRIGHT_COUNTS + _SPAN_PERCENT / 100 * (AD_MAX - self.seen(lit) * AD_MAX / 100))
             self._sample = (number, lit, min(max(raw, 0), AD_MAX))
         return self._sample[2]
@@ -94,7 +94,8 @@ class InputPorts:
             return False
         if port.kind != _NONE:
             raw = port.sensor(port.kind == _LIGHT_ON)
-            normalized = _normalized_light(raw) if port.kind in (_LIGHT_ON, _LIGHT_OFF) else raw
+            dark = max(raw - _BRIGHT_COUNTS, 0) * 100 // _SPAN_PERCENT  # in integers, as the firmware does
+            normalized = AD_MAX - min(dark, AD_MAX) if port.kind in (_LIGHT_ON, _LIGHT_OFF) else raw
             scaled = normalized * 100 // AD_MAX if port.mode & 0xE0 == _PERCENT else normalized
             port.shown = (raw, normalized, scaled)
         return True
@@ -103,11 +104,6 @@ class InputPorts:
         if number >= len(self._ports):
             raise RefusedError(Status.OUT_OF_RANGE)
         return self._ports[number]
-
-
-def _normalized_light(raw: int) -> int:
-    """Scale counts to 0..1023 in integers, as the firmware does; more light gives a larger value."""
-    return AD_MAX - min(max(raw - _BRIGHT_COUNTS, 0) * 100 // _SPAN_PERCENT, AD_MAX)
 
 
 ADDRESS = bytes.fromhex("0016530A0B0C")

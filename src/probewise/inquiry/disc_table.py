@@ -93,7 +93,12 @@ class DiscTable:
         across = np.where(upper, 1.0 - pseudo_angle, pseudo_angle - 3.0)
         up = np.where(upper, 1.0, -1.0) * (1.0 - np.abs(across))
         directions = np.stack([across, up], axis=-1) / np.hypot(across, up)[:, None]
-        margin = _distance_to_constant_reading_mm(model, low, high, directions[:: _DIRECTIONS // 16], dark, bright)
+        margin = _COARSE_MM  # distance from the edge beyond which the reading is constant, for small and large discs
+        for radius in (low, high):
+            distance = np.arange(-min(radius, _PROBE_MM), _PROBE_MM, _COARSE_MM)
+            around = _readings_around_disc(model, radius, directions[:: _DIRECTIONS // 16], distance)
+            off = np.abs(around - np.where(distance <= 0.0, bright, dark)) > _FLAT * abs(bright - dark)
+            margin = max(margin, float(np.abs(distance[off.any(axis=0)]).max(initial=0.0)) + _COARSE_MM)
         if margin >= _PROBE_MM:
             return None
         coarse = np.linspace(-margin, margin, 2 * int(np.ceil(margin / _COARSE_MM)) + 1)
@@ -338,19 +343,6 @@ def _readings_outside_and_inside(model: SensorModel, radius_mm: float) -> tuple[
     allowed = "two different levels: a sensor that tells the disc from its surroundings"
     require(dark != bright, "levels", (dark, bright), allowed)
     return float(dark), float(bright)
-
-
-def _distance_to_constant_reading_mm(
-    model: SensorModel, low_mm: float, high_mm: float, directions: FloatArray, dark: float, bright: float
-) -> float:
-    """Return the distance from a disc's edge beyond which the reading is constant, for small and large discs alike."""
-    margin = _COARSE_MM
-    for radius in (low_mm, high_mm):
-        distance = np.arange(-min(radius, _PROBE_MM), _PROBE_MM, _COARSE_MM)
-        readings = _readings_around_disc(model, radius, directions, distance)
-        off = np.abs(readings - np.where(distance <= 0.0, bright, dark)) > _FLAT * abs(bright - dark)
-        margin = max(margin, float(np.abs(distance[off.any(axis=0)]).max(initial=0.0)) + _COARSE_MM)
-    return margin
 
 
 @dataclass(frozen=True, eq=False)

@@ -410,26 +410,13 @@ def choose_several(
     few = replace(inputs, theta=inputs.theta[rows], weight=share / share.sum())
     weights = [few.weight] * _OUTCOMES
     for _ in range(n - 1):
-        weights = _weights_after_simulated_reading(few, chosen[-1], weights, rng)
+        # Each posterior after one reading that it simulates at the last design.
+        level = few.forecast.predict(few.theta, few.plan.take(few.rows[[chosen[-1]]]))[:, 0]
+        sd = few.readout.noise_sd / np.sqrt(few.designs.n_repeats[few.rows[chosen[-1]]])
+        for k, weight in enumerate(weights):
+            truth = rng.choice(len(weight), p=weight)
+            after = weight * np.exp(-0.5 * ((level[truth] + sd * rng.standard_normal() - level) / sd) ** 2)
+            weights[k] = after / after.sum()
         gain = np.mean([few.information(weight) for weight in weights], axis=0)
         chosen.append(choose(gain * weighing, everywhere, rng=rng))
     return tuple(int(inputs.rows[row]) for row in chosen)
-
-
-def _weights_after_simulated_reading(
-    inputs: UtilityInput, row: int, weights: list[FloatArray], rng: np.random.Generator
-) -> list[FloatArray]:
-    """Simulate one reading per posterior at design `inputs.rows[row]`; return the posteriors' weights after it.
-
-    `weights`: of each posterior, (n_samples,).
-    """
-    readout = inputs.readout
-    level = inputs.forecast.predict(inputs.theta, inputs.plan.take(inputs.rows[[row]]))[:, 0]
-    sd = readout.noise_sd / np.sqrt(inputs.designs.n_repeats[inputs.rows[row]])
-    out = []
-    for weight in weights:
-        truth = rng.choice(len(weight), p=weight)
-        away = (level[truth] + sd * rng.standard_normal() - level) / sd
-        after = weight * np.exp(-0.5 * away**2)
-        out.append(after / after.sum())
-    return out

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -76,11 +75,6 @@ def _along_label(tracks: Sequence[Track], side: str = "") -> str:
     return _ALONG_EDGE.format(side) if all(t.from_edge for t in tracks) else _ALONG_SCAN
 
 
-def _symbol_of_track(k: int) -> dict[str, Any]:
-    marker, colour = _MARKERS[k % len(_MARKERS)], canvas.CYCLE[k % len(canvas.CYCLE)]
-    return {"linestyle": "none", "marker": marker, "color": colour, "markerfacecolor": "none"}
-
-
 def readings_by_orientation(recording: Recording, *, ax: Axes | None = None) -> Axes:
     """Draw readings against distance from the edge, a symbol for each orientation (paper, figure 5).
 
@@ -94,7 +88,8 @@ def readings_by_orientation(recording: Recording, *, ax: Axes | None = None) -> 
     for k, track in enumerate(tracks):
         ok = recording.usable[track.rows]
         along, readings = track.along_mm[ok], recording.readings[track.rows][ok]
-        ax.plot(along, readings, markersize=size, markeredgewidth=1.0, label=track.label, **_symbol_of_track(k))
+        (drawn,) = ax.plot(along, readings, _MARKERS[k % len(_MARKERS)], markersize=size, label=track.label)
+        drawn.set(color=canvas.CYCLE[k % len(canvas.CYCLE)], markerfacecolor="none", markeredgewidth=1.0)
     if 0 < len(tracks) <= _MOST_NAMED:
         turned = all("°" in track.label for track in tracks)
         canvas.legend_above(ax, title="orientation of the sensor" if turned else "scan")

@@ -48,8 +48,6 @@ MODEL = Chain(MIXTURE, FixedLevels(10.0, 60.0), HypothesisScene(CIRCLE))
 SENSOR = sensor_of(np.tile(TRUTH, (500, 1)))
 EXPERIMENT = Experiment(CIRCLE, MODEL, GaussianKnown(0.7), 0.7)
 ARM = SimulatedArm(lambda pose, time_s, height_mm: 10.0)
-
-
 TABLE = {"run": ["a"] * 12, "t_s": np.arange(12.0), "temp_c": 20.0 + np.arange(12.0)}
 
 

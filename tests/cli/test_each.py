@@ -107,10 +107,7 @@ def test_the_processes_of_a_killed_command_end_with_it_and_leave_no_file(number,
     use = "import os, tempfile\nfrom probewise.cli._executor import worker_pool\nwith worker_pool(2) as pool:\n"
     killed = f"{use}    pool.submit(tempfile.mkdtemp).result()\n    os.kill(os.getpid(), {number:d})"
     ended = subprocess.run(
-        [sys.executable, "-c", killed],
-        env={**os.environ, "TMPDIR": str(tmp_path)},
-        capture_output=True,
-        timeout=60,
+        [sys.executable, "-c", killed], env={**os.environ, "TMPDIR": str(tmp_path)}, capture_output=True, timeout=60
     )
     assert ended.returncode == -number
     assert not any(tmp_path.iterdir())

@@ -1,7 +1,5 @@
 """The next readings."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Aliased effects and what separates them."""
 
-from __future__ import annotations
-
 from typing import Any, cast
 
 import numpy as np

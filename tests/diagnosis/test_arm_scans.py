@@ -1,7 +1,5 @@
 """Scans that the arm could take next."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Audit of a plan."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

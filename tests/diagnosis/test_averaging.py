@@ -1,7 +1,5 @@
 """Samples averaged over orders and hypotheses."""
 
-from __future__ import annotations
-
 import dataclasses
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """The gain of a repair, and the correction where it has no name."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The whole road, on recordings of an independent world that shares no code with the model."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import json
@@ -36,13 +34,13 @@ def forth_and_back() -> Plan:
 
 
 @functools.cache
-def noise_free(plan_name: str, *concealed: hidden.Concealed) -> Recording:
+def noise_free(plan_name: str, *concealed) -> Recording:
     plan = {"paper": paper_plan, "two_way": two_way_plan, "forth_and_back": forth_and_back}[plan_name]()
     spot = gaussian_spot([Blob(1.0, (1.5, 2.5), (6.0, 8.0), 0.2)], pixel_mm=1.0)
     return Recording(plan, World(spot, concealed=concealed).expected_readings(plan))
 
 
-def recording(plan_name: str, *concealed: hidden.Concealed, seed: int = 1) -> Recording:
+def recording(plan_name: str, *concealed, seed: int = 1) -> Recording:
     found = noise_free(plan_name, *concealed)
     rng = np.random.default_rng(seed)
     return dataclasses.replace(found, readings=found.readings + NOISE_SD * rng.standard_normal(len(found)))

@@ -1,7 +1,5 @@
 """Diagnosis of a simulator."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The result of a diagnosis."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Evidence of fits: detectable sizes, refined nodes, values per run; principal axes of Gram matrices."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from types import SimpleNamespace
@@ -14,24 +12,13 @@ from scipy.stats import norm
 
 from probewise.diagnosis.apparatus import PriorOdds
 from probewise.diagnosis.diagnose_simulator import prepare_system
-from probewise.diagnosis.evidence import (
-    LEAST_VISIBLE,
-    laplace_evidence,
-    log_probability_effects_detectable,
-    refined,
-)
+from probewise.diagnosis.evidence import LEAST_VISIBLE, laplace_evidence, log_probability_effects_detectable, refined
 from probewise.diagnosis.fit import Fit, Model, effect_coordinates, fit
 from probewise.diagnosis.noise import SAME_SD, NoiseModel, SdPrior, white_noise, white_noise_of_recording
 from probewise.diagnosis.search.hypotheses import NoiseModels
 from probewise.diagnosis.sensors import default_sensor
 from probewise.effects import VOCABULARY, Extent, NoiseEffect
-from probewise.effects.noise import (
-    correlated_noise,
-    drifting_noise,
-    outliers,
-    random_walk,
-    signal_dependent_noise,
-)
+from probewise.effects.noise import correlated_noise, drifting_noise, outliers, random_walk, signal_dependent_noise
 from probewise.recordings import Plan, Recording, paper_plan
 from probewise.systems import Simulator, table_for
 

@@ -1,7 +1,5 @@
 """Fine structure of an SSF."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

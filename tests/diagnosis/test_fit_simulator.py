@@ -1,7 +1,5 @@
 """Fit of a simulator without a diagnosis."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Formulas for effects out of vocabulary."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Gain on held-out readings."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Folded priors of exchangeable Gaussians."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Readings of a table that are left out."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import replace
 

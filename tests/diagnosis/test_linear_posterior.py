@@ -1,7 +1,5 @@
 """Posteriors in closed form, against quadrature and sampling."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

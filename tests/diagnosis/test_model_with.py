@@ -1,7 +1,5 @@
 """The model with effects that somebody has chosen."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Distributions of the noise."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from types import SimpleNamespace
@@ -21,14 +19,8 @@ from probewise.world.spots import Blob, gaussian_spot
 from probewise.world.world import World
 
 PLAN = paper_plan()
-
-
 N = len(PLAN)
-
-
 SD = 0.6
-
-
 MEAN = 35.0 + 25.0 * np.tanh(PLAN.x_mm / 8)
 
 

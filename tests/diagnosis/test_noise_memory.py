@@ -1,7 +1,5 @@
 """Noise with memory given other readings, and outlying readings beside a random walk."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import replace
@@ -12,12 +10,7 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
 from probewise.diagnosis.evidence import predictive_log_densities
-from probewise.diagnosis.noise import (
-    NoiseLaw,
-    innovations_given_rest,
-    walk_given_readings,
-    with_known_wide_readings,
-)
+from probewise.diagnosis.noise import NoiseLaw, innovations_given_rest, walk_given_readings, with_known_wide_readings
 
 _N = 40
 

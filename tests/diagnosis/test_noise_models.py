@@ -1,7 +1,5 @@
 """Noise of runs, one after the other and interleaved."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -9,12 +7,7 @@ import numpy as np
 import pytest
 from scipy.special import gammaln, logsumexp
 
-from probewise.diagnosis.noise import (
-    n_rows_since_previous_usable,
-    order_by_scan,
-    previous_usable,
-    white_noise,
-)
+from probewise.diagnosis.noise import n_rows_since_previous_usable, order_by_scan, previous_usable, white_noise
 from probewise.effects.noise import noise_of_runs
 from probewise.effects.noise_distribution import FittedReadings
 from probewise.systems import RunTable, Simulator, as_recording
@@ -51,14 +44,8 @@ def test_the_evidence_of_noise_per_run_is_that_of_brute_force():
 SIMULATOR = Simulator(
     "y", "V", {"a": (-5, 5), "b": (-5, 5)}, simulate=lambda p, u: p["a"] + p["b"] * u["x"], run="run", vectorized=True
 )
-
-
 N = 40
-
-
 RUN = np.random.default_rng(1).permutation(np.repeat([0.0, 1.0, 2.0, 3.0], 10))
-
-
 SORTED = np.argsort([list(dict.fromkeys(RUN.tolist())).index(run) for run in RUN.tolist()], kind="stable")
 
 

@@ -1,7 +1,5 @@
 """Tables that are hardly tables."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Lost and outlying readings."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.stats import betabinom

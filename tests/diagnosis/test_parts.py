@@ -1,7 +1,5 @@
 """The parts of the diagnosis, each against a second route to the same number."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from types import SimpleNamespace

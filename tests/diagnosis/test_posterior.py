@@ -1,7 +1,5 @@
 """Draws from a posterior: by annealing, and through predictions to second order about a point."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

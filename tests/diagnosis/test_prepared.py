@@ -1,7 +1,5 @@
 """Input of a diagnosis, of long recordings a part."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Prior odds of hypotheses."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from itertools import combinations
@@ -17,8 +15,6 @@ from probewise.recordings import two_way_plan
 from probewise.sensor import Stage
 
 OF_NO_LAW = SimpleNamespace(about=SimpleNamespace(states_with_rates_by_definition=frozenset()))
-
-
 EXTENT = Extent(10.0, 60.0, two_way_plan())
 EFFECTS = {**VOCABULARY, **RARE_EFFECTS}
 

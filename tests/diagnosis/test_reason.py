@@ -1,7 +1,5 @@
 """The verdict's reason in words."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

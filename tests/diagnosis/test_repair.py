@@ -1,7 +1,5 @@
 """Predictions and residuals of the repaired model, and where effects show."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 

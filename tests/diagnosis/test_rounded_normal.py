@@ -1,7 +1,5 @@
 """Rounded normal noise."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
@@ -16,14 +14,13 @@ from probewise.diagnosis.search.hypotheses import NoiseModels
 from probewise.effects import VOCABULARY, Extent
 from probewise.recordings import Recording, paper_plan
 from probewise.sensor import Stage
-from probewise.world import concealed as hidden
 from probewise.world.spots import Blob, gaussian_spot
 from probewise.world.world import World
 
 STEP, SIGMA = 4.0, 0.7
 
 
-def rounded(noise_sd: float, seed: int, *concealed: hidden.Concealed) -> Recording:
+def rounded(noise_sd: float, seed: int, *concealed) -> Recording:
     plan = paper_plan()
     spot = gaussian_spot([Blob(1.0, (1.5, 2.5), (6.0, 8.0), 0.2)], pixel_mm=1.0)
     mean = World(spot, concealed=concealed).expected_readings(plan)

@@ -1,7 +1,5 @@
 """Posterior samples of a model, and the probabilities of variants beside other effects."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Audit of a table."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from heater import heater, runs

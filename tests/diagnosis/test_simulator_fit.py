@@ -1,7 +1,5 @@
 """Starts of a simulator's fit, and its integration step."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

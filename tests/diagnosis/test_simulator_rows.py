@@ -1,7 +1,5 @@
 """A simulator over a table: columns, effects, runs to record next."""
 
-from __future__ import annotations
-
 from typing import cast
 
 import numpy as np
@@ -12,14 +10,7 @@ from probewise.diagnosis.diagnose_simulator import diagnose_system, prepare_syst
 from probewise.diagnosis.fit import Model
 from probewise.diagnosis.simulator_rows import SimulatorApparatus, candidate_runs
 from probewise.recordings import Plan
-from probewise.systems import (
-    Law,
-    RunTable,
-    Simulator,
-    System,
-    concatenate_tables,
-    table_for,
-)
+from probewise.systems import Law, RunTable, Simulator, System, concatenate_tables, table_for
 from probewise.systems.forms import ReferenceFit, bind_forms
 from probewise.systems.forms.formulas import formula_forms
 from probewise.systems.table import covariate_of_column

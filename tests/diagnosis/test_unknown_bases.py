@@ -1,7 +1,5 @@
 """Basis functions of unknown effects."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The verdict from probabilities."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import pytest

@@ -1,7 +1,5 @@
 """Names in words."""
 
-from __future__ import annotations
-
 import pytest
 
 from probewise.diagnosis.words import join_lists, parameter_in_words

@@ -9,11 +9,7 @@ from scipy import stats
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from probewise.effects.noise_distribution import (
-    PredictiveMixture,
-    limited_mean,
-    log_rounding_cell_density,
-)
+from probewise.effects.noise_distribution import PredictiveMixture, limited_mean, log_rounding_cell_density
 from probewise.sensor.stages import NoiseParameters
 
 

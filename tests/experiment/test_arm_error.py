@@ -10,12 +10,7 @@ from exploring import run
 from scipy.special import ndtr
 
 from probewise.arm import read_geometry, shipped_geometry_path
-from probewise.arm.geometry import (
-    FITTED,
-    RULER_SDS,
-    Accuracy,
-    place_jacobian,
-)
+from probewise.arm.geometry import FITTED, RULER_SDS, Accuracy, place_jacobian
 from probewise.errors import ParameterError
 from probewise.experiment import FittedArm, estimated_shape, result_json, samples_csv
 from probewise.experiment.arm_error import arm_error_in_posterior

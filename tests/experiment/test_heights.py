@@ -113,10 +113,7 @@ class OwnArm:
         return {"value": value, **self.tells}
 
 
-ELSEWHERE = {
-    "of each reading": OwnArm({"height_mm": 20.0}),
-    "of the arm": OwnArm({}, read_height_mm=20.0),
-}
+ELSEWHERE = {"of each reading": OwnArm({"height_mm": 20.0}), "of the arm": OwnArm({}, read_height_mm=20.0)}
 
 
 @pytest.mark.parametrize("arm", ELSEWHERE.values(), ids=ELSEWHERE.keys())

@@ -6,15 +6,7 @@ import numpy as np
 import pytest
 
 from probewise.effects import EFFECTS, VOCABULARY, Known
-from probewise.inquiry import (
-    Designs,
-    DiscForecast,
-    Grid,
-    Readout,
-    TabulatedChain,
-    UtilityInput,
-    forecast_of,
-)
+from probewise.inquiry import Designs, DiscForecast, Grid, Readout, TabulatedChain, UtilityInput, forecast_of
 from probewise.inquiry.disc_table import DiscTable
 from probewise.inquiry.forecast import MOST_LEVELS
 from probewise.scene import Circle, HypothesisScene, Rectangle

@@ -11,16 +11,7 @@ from scipy import stats
 from scipy.special import i0e
 
 from probewise.errors import NotConvergedError, ParameterError
-from probewise.nested import (
-    Evaluator,
-    SliceMove,
-    diversify,
-    make_problem,
-    merge,
-    refine,
-    run,
-    update,
-)
+from probewise.nested import Evaluator, SliceMove, diversify, make_problem, merge, refine, run, update
 from probewise.nested.importance import repartitioned
 from probewise.nested.problem import Bound
 from probewise.priors import Joint, Product, Uniform

@@ -11,10 +11,7 @@ from scipy.stats import chi2, norm
 from probewise._arrays import FloatArray
 from probewise.nested import Weighted, pareto_k, run, update
 from probewise.nested.clusters import find_disconnected_clusters
-from probewise.nested.importance import (
-    _bridge_sampling_estimate,
-    with_error_of_lost_parts,
-)
+from probewise.nested.importance import _bridge_sampling_estimate, with_error_of_lost_parts
 from probewise.nested.problem import unbounded_space_of
 from probewise.priors import Normal, Product
 

@@ -9,16 +9,7 @@ from runs import N_ERRORS
 from scipy.stats import kstest
 
 from probewise.errors import DoubtfulResultWarning, NotConvergedError, ParameterError
-from probewise.nested import (
-    Bound,
-    Evaluator,
-    EvidenceChange,
-    Points,
-    PriorRejection,
-    RemainingEvidence,
-    SliceMove,
-    run,
-)
+from probewise.nested import Bound, Evaluator, EvidenceChange, Points, PriorRejection, RemainingEvidence, SliceMove, run
 from probewise.nested.clusters import find_clusters
 from probewise.nested.evidence import insertion_p_value, insertion_ranks
 from probewise.nested.sampler import replace_worst_live_points, run_once

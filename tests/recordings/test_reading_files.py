@@ -23,8 +23,6 @@ from probewise.recordings import (
 )
 
 WHITE = {"white": {"kind": "uniform", "albedo": 1}}
-
-
 TWO = {**WHITE, "edge": {"kind": "half_plane", "normal_deg": 90, "offset_mm": 2}}
 
 

@@ -15,8 +15,6 @@ from probewise.report.headline import MOST_WORDS, headline
 
 NAMES = sorted(VOCABULARY)
 PLAN = SimpleNamespace(instrumentation=Instrumentation())
-
-
 NOISE = ("quantisation", "correlated_noise")
 
 

@@ -2,10 +2,7 @@
 
 import pytest
 
-from probewise.report.words import (
-    value_and_interval_texts,
-    value_with_error,
-)
+from probewise.report.words import value_and_interval_texts, value_with_error
 
 
 @pytest.mark.parametrize(

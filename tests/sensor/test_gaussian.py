@@ -8,12 +8,7 @@ from scipy.stats import multivariate_normal
 
 from probewise.errors import SlowWarning
 from probewise.recordings import patterns as kinds
-from probewise.scene import (
-    PolygonRegion,
-    QuadrantRegion,
-    disc_region,
-    region_of,
-)
+from probewise.scene import PolygonRegion, QuadrantRegion, disc_region, region_of
 from probewise.sensor import FAST_NODES, gaussian
 from probewise.sensor.gaussian import normal_cdf
 

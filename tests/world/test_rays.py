@@ -16,13 +16,7 @@ SPOTS = {
     "gaussian": lambda pixel_mm: gaussian_spot([BLOB], pixel_mm=pixel_mm),
     "two gaussians": lambda pixel_mm: gaussian_spot([BLOB, Blob(0.5, (3, -2), (1.5, 2), -0.5)], pixel_mm=pixel_mm),
     "ridge": lambda pixel_mm: ridge_spot(
-        9.0,
-        center_mm=(0.0, 1.5),
-        lobes=0.35,
-        ridge_mm=-3.0,
-        ridge_width_mm=1.2,
-        shadow=0.6,
-        pixel_mm=pixel_mm,
+        9.0, center_mm=(0.0, 1.5), lobes=0.35, ridge_mm=-3.0, ridge_width_mm=1.2, shadow=0.6, pixel_mm=pixel_mm
     ),
     "tailed": lambda pixel_mm: tailed_spot((1.5, 1.0), center_mm=(0.0, 1.5), skew=0.4, pixel_mm=pixel_mm),
 }

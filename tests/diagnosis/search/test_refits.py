@@ -1,7 +1,5 @@
 """Refits, and those that are spared."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 
@@ -11,10 +9,7 @@ from refitted import state_with_nulls
 
 from probewise.diagnosis import search as searching
 from probewise.diagnosis.diagnose_simulator import prepare_system
-from probewise.diagnosis.search.hypotheses import (
-    Evidences,
-    hypothesis_probabilities,
-)
+from probewise.diagnosis.search.hypotheses import Evidences, hypothesis_probabilities
 from probewise.effects import Extent
 from probewise.effects.noise import correlated_noise, random_walk
 from probewise.priors import LogUniform, Uniform

@@ -1,7 +1,5 @@
 """Stepwise selection of effects, and pruning."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 

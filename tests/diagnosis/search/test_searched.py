@@ -1,7 +1,5 @@
 """The result of a search: what counts under which name."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from types import SimpleNamespace

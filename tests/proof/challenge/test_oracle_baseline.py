@@ -5,11 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from probewise.proof.tables import (
-    oracle_credible_set_size,
-    oracle_name_rate,
-    readings_to_separate_alias,
-)
+from probewise.proof.tables import oracle_credible_set_size, oracle_name_rate, readings_to_separate_alias
 
 from ..conftest import case, hidden
 

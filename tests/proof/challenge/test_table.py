@@ -111,10 +111,7 @@ FOUND = {
         {UNLISTED: 0.5},
     ),
     "aliases, told apart by the advised readings": (
-        [
-            aliased("cannot_tell", settled={"hypotheses": [[["lag"], 0.99]], "readings": 51}),
-            aliased("named", p=0.95),
-        ],
+        [aliased("cannot_tell", settled={"hypotheses": [[["lag"], 0.99]], "readings": 51}), aliased("named", p=0.95)],
         {
             "aliased pair: cannot tell": 0.5,
             "aliased pair: sure of the wrong name": 0.5,

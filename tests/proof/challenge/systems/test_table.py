@@ -56,10 +56,7 @@ FOUND = {
     "a law on no list unlike it is not": ([unlisted(["settling"], alternative_nats={"settling": 38.1})], {WRONG: 1.0}),
     "alarms and names on clean recordings": (
         [system_case(), system_case(p_value=0.01, said=["lag"])],
-        {
-            "false alarms, no effect, white noise, alpha .05": 0.5,
-            "physics named, no effect, white noise": 0.5,
-        },
+        {"false alarms, no effect, white noise, alpha .05": 0.5, "physics named, no effect, white noise": 0.5},
     ),
     "noise of another kind by itself": (
         [system_case(truth=["outliers"], other_noise=True, noise_model="outliers", p_value=0.4)],

@@ -1,4 +1,4 @@
-"""The next readings."""
+"""The next readings: what separates hypotheses, aliased effects, scans that the arm could take."""
 
 import math
 from dataclasses import replace
@@ -7,27 +7,38 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from heater import ABOUT, TABLE
+from heater import ABOUT, SIMULATOR, TABLE, runs
 from mixtures import fixed_mixture
 from scipy.stats import multivariate_normal
 
 from probewise.diagnosis import TO_SEPARATE, diagnose_system
 from probewise.diagnosis.advice import (
+    Alias,
     PredictiveNormal,
     Rival,
     choose_next_measurement,
     is_settled,
     measurement_separating_rivals,
     mutual_information_lower_bound,
+    pairs_with_separating_scans,
 )
 from probewise.diagnosis.apparatus import ENOUGH_NATS, MOST_ADVISED_READINGS
-from probewise.diagnosis.fit import Model
-from probewise.diagnosis.light_sensor import LightSensorApparatus, target_swaps
+from probewise.diagnosis.diagnose_simulator import prepare_system
+from probewise.diagnosis.evidence import Linearised
+from probewise.diagnosis.fit import Model, fit
+from probewise.diagnosis.light_sensor import (
+    LightSensorApparatus,
+    candidate_scans,
+    rows_of_distinct_scans,
+    target_swaps,
+    varying_covariates,
+)
 from probewise.diagnosis.locate import Place
+from probewise.diagnosis.noise import white_noise_of_recording
 from probewise.diagnosis.sensors import default_sensor
 from probewise.diagnosis.simulator_rows import SimulatorApparatus
 from probewise.effects import VOCABULARY, Extent
-from probewise.recordings import HalfPlane, Plan, Recording, paper_plan, read_plan, write_plan
+from probewise.recordings import HalfPlane, Plan, Recording, paper_plan, read_plan, two_way_plan, write_plan
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FixedLevels
 from probewise.systems import Noise, RunTable, Simulator
@@ -235,7 +246,7 @@ def simulate(p, data):
     return p["off"] + p["slope"] * data["x"]
 
 
-SIMULATOR = Simulator(
+SIMULATOR_OF_ALIASES = Simulator(
     reading="y_v",
     unit="V",
     run="day",
@@ -255,7 +266,7 @@ def table() -> RunTable:
 
 
 def test_where_no_readings_separate_the_named_hypotheses_the_verdict_says_so():
-    diagnosis = diagnose_system(SIMULATOR, table(), rng=np.random.default_rng(1))
+    diagnosis = diagnose_system(SIMULATOR_OF_ALIASES, table(), rng=np.random.default_rng(1))
     nothing = diagnosis.apparatus.words.settles_nothing
     assert diagnosis.verdict == "cannot_tell"
     assert TO_SEPARATE not in diagnosis.reason
@@ -263,3 +274,80 @@ def test_where_no_readings_separate_the_named_hypotheses_the_verdict_says_so():
         assert f"{name} (0.48)" in diagnosis.reason
     assert diagnosis.reason.endswith(f"; {nothing}.")
     assert diagnosis.next_measurement is None
+
+
+PREPARED = prepare_system(SIMULATOR, runs(rng=np.random.default_rng(3), n=20))
+RECORDING, PLAN, APPARATUS_OF_ALIASES = PREPARED.recording, PREPARED.recording.plan, PREPARED.apparatus
+LAW = white_noise_of_recording(RECORDING)
+FOUND = fit(Model(cast(Any, PREPARED.null), (), PLAN), RECORDING, cast(Any, PREPARED.null).first, LAW)
+PROBLEM = Linearised.of(FOUND, LAW)
+NOTHING = APPARATUS_OF_ALIASES.words.settles_nothing
+
+
+def advised(*names: str) -> Alias:
+    entries = {name: (PREPARED.effects[name], PREPARED.effects[name].entries[0]) for name in names}
+    pair = Alias(cast(Any, names), 1.0, NOTHING, 0)
+    (found,) = pairs_with_separating_scans(
+        [pair], PROBLEM, FOUND, entries, np.arange(len(RECORDING.readings)), APPARATUS_OF_ALIASES
+    )
+    return found
+
+
+def test_a_value_per_run_separates_nothing_that_a_start_of_each_run_absorbs():
+    """An offset of each run and a start of each run are the same in a new run too, which has one of each."""
+    alias = advised("offset_per_run", "depends:start_c:room_c")
+    assert (alias.settle_by, alias.readings) == (NOTHING, 0)
+
+
+def without_controls():
+    plan = two_way_plan()
+    return replace(plan, instrumentation=replace(plan.instrumentation, controls=()))
+
+
+def lying(plan):
+    return plan.pattern_names[int(plan.pattern[np.argmax(plan.time_s)])]
+
+
+def test_without_hands_all_scans_are_over_what_lies_there():
+    plan = without_controls()
+    offered = LightSensorApparatus(hands=False).candidate_measurements(plan)
+    assert offered
+    assert {scan.plan.pattern_names[int(k)] for scan in offered for k in scan.plan.pattern} == {lying(plan)}
+    assert "lay" not in {scan.kind for scan in offered}
+    assert len(offered) < len(LightSensorApparatus().candidate_measurements(plan))
+
+
+def test_a_scan_that_returns_after_a_whole_turn_is_the_same_scan_at_the_same_orientation():
+    """It is neither offered twice, nor a value of the covariate `orientation`."""
+    plan = two_way_plan()
+    turned = replace(plan, orientation_rad=plan.orientation_rad - 2 * np.pi * (plan.scan % 2))
+    assert [scan.tolist() for scan in rows_of_distinct_scans(turned)] == [
+        scan.tolist() for scan in rows_of_distinct_scans(plan)
+    ]
+    level, everything = np.linspace(0.0, 1.0, len(plan)), np.arange(len(plan))
+
+    def orientations(of):
+        found = varying_covariates(of, everything, level, level)
+        return next(
+            np.unique(covariate.values, return_inverse=True)[1]
+            for covariate in found
+            if covariate.name == "orientation"
+        )
+
+    kinds = orientations(plan)
+    assert len(set(zip(kinds, orientations(turned), strict=True))) == kinds.max() + 1
+
+
+def test_a_scan_is_raised_from_the_height_at_which_it_was_taken():
+    plan = two_way_plan()
+    plan = replace(plan, instrumentation=replace(plan.instrumentation, controls=("height_mm",), height_mm=16.0))
+    second, third = rows_of_distinct_scans(plan)[1:3]
+    heights = np.full(len(plan), np.nan)
+    heights[second], heights[third[::2]] = 20.0, 20.0
+    lifted = replace(plan, covariates={**plan.covariates, "height_mm": heights})
+    raised = [scan for scan in candidate_scans(lifted) if scan.kind == "raise"]
+    np.testing.assert_array_equal(raised[0].plan.covariates["height_mm"], 20.0)
+    np.testing.assert_array_equal(raised[1].plan.covariates["height_mm"], 25.0)
+    np.testing.assert_array_equal(np.unique(raised[2].plan.covariates["height_mm"]), [20.0, 25.0])
+    endings = ("with the sensor at 20 mm", "with the sensor at 25 mm", "with the sensor at 1.25 times its height")
+    assert all(scan.description.endswith(words) for scan, words in zip(raised[:3], endings, strict=True))

@@ -1,4 +1,4 @@
-"""Formulas for effects out of vocabulary."""
+"""What no name explains: bases, formulas, fine structure of an SSF."""
 
 from dataclasses import replace
 
@@ -7,9 +7,20 @@ import pytest
 
 from probewise.diagnosis.diagnose_simulator import diagnose_system, prepare_system
 from probewise.diagnosis.diagnosis import diagnose_prepared
+from probewise.diagnosis.evidence import Linearised
+from probewise.diagnosis.fit import Fit, Model, fit
+from probewise.diagnosis.light_sensor import varying_covariates
+from probewise.diagnosis.locate import Covariate
+from probewise.diagnosis.noise import white_noise
 from probewise.diagnosis.search import search
+from probewise.diagnosis.sensors import default_sensor, fine_structure_slopes, with_free_form
+from probewise.diagnosis.unknown_bases import PRODUCTS, bank_of_unknown_effects
 from probewise.diagnosis.verdict import run_global_test
+from probewise.effects import VOCABULARY, Extent
+from probewise.recordings import Recording, paper_plan, two_way_plan
 from probewise.systems import RunTable, Simulator, table_for
+from probewise.world.spots import Blob, gaussian_spot, ring_spot
+from probewise.world.world import World
 
 SD = 0.05
 
@@ -105,3 +116,116 @@ def test_a_formula_that_the_readings_proposed_is_no_test_of_them():
     more = replace(searched, prepared=replace(prepared, effects={**prepared.effects, **formulas}))
     tests = [run_global_test(each, rng=np.random.default_rng(1)) for each in (searched, more)]
     assert tests[0].p_value == tests[1].p_value
+
+
+PLAN = two_way_plan()
+N = len(PLAN)
+SIGNAL = 25.0 * (1 + np.tanh(PLAN.x_mm / 8))
+FORTH = np.sign(PLAN.direction_of_motion[:, 0])
+IN_X = 25.0 / 8 / np.cosh(PLAN.x_mm / 8) ** 2  # the signal's slope in the lab frame
+SLOPE = IN_X * np.where(FORTH == 0, 1.0, FORTH)  # and along the move
+STARTS = np.flatnonzero(np.diff(PLAN.scan, prepend=-1))
+BASES = bank_of_unknown_effects(varying_covariates(PLAN, np.arange(N), SIGNAL, SLOPE), SIGNAL, SLOPE, PLAN.scan)
+TEMPLATES = [BASES[k] for k in range(len(BASES.widths))]
+TIME = (PLAN.time_s - PLAN.time_s.min()) / np.ptp(PLAN.time_s)
+MISMATCHES = {
+    "a rail bent along X": IN_X * (PLAN.x_mm / 50) ** 2,
+    "a slip along X at a moment": IN_X * (TIME > 0.5),
+    "a gain that wanders in time": SIGNAL * np.sin(9 * TIME),
+    "a wave in time": np.sin(20 * TIME),
+    "a tone that slides": np.sin(2 * np.pi * (4 * TIME + 14 * TIME**2)),
+    "a bend of the response": SIGNAL * (SIGNAL.max() - SIGNAL),
+    "a gain for each angle": SIGNAL * np.cos(2 * PLAN.orientation_rad),
+    "a start of each scan": np.exp(-(np.arange(N) - np.repeat(STARTS, np.diff(STARTS, append=N))) / 2),
+    "the brightest so far": np.concatenate([np.maximum.accumulate(part) for part in np.split(SIGNAL, STARTS[1:])]),
+}
+
+
+@pytest.mark.parametrize("mismatch", MISMATCHES.values(), ids=MISMATCHES)
+def test_some_basis_holds_it(mismatch):
+    left = []
+    for columns in TEMPLATES:
+        amount = np.linalg.lstsq(columns, mismatch)[0]
+        left.append(float(np.sum((mismatch - columns @ amount) ** 2) / np.sum(mismatch**2)))
+    assert min(left) < 0.1
+
+
+def _three_columns_and_bases():
+    """Return three columns, (3, 200), of 190, 200 and 200 rows, and the bases with and without their products."""
+    rng = np.random.default_rng(8)
+    columns = rng.normal([[20.0], [45.0], [1e-9]], [[3.0], [9.0], [1e-10]], (3, 200))
+    rows = [np.arange(10, 200), np.arange(200), np.arange(200)]
+    covariates = [Covariate(name, c[at], at) for name, c, at in zip("abc", columns, rows, strict=True)]
+    level = rng.random(200)
+    apart = bank_of_unknown_effects(covariates, level, np.gradient(level), None)
+    return columns, bank_of_unknown_effects(covariates, level, np.gradient(level), None, multiplied=covariates), apart
+
+
+def test_products_of_two_columns_are_one_family_that_no_function_of_one_imitates():
+    columns, bases, apart = _three_columns_and_bases()
+    assert PRODUCTS not in apart.labels
+    products = [bases[int(k)][:, 0] for k in bases.indices_by_label[PRODUCTS]]
+    centred = columns - columns.mean(axis=1, keepdims=True)
+    centred[0] = np.where(np.arange(200) < 10, 0.0, columns[0] - columns[0, 10:].mean())
+    for product, (first, second) in zip(products, [(0, 1), (0, 2), (1, 2)], strict=True):
+        wanted = centred[first] * centred[second]
+        assert np.corrcoef(product, wanted)[0, 1] == pytest.approx(1.0)
+        assert np.all(product[:10] == 0) == (first == 0)
+        every = [apart[k] for k in range(len(apart.widths))]
+        left = [np.sum((wanted - t @ np.linalg.lstsq(t, wanted)[0]) ** 2) / np.sum(wanted**2) for t in every]
+        assert min(left) > 0.7
+
+
+NOISE_SD = 0.4
+
+
+def fitted(recording: Recording, *, free: bool = True) -> Fit:
+    sensor = default_sensor(Extent.of(recording), 1)
+    law = white_noise(len(recording))
+    one = fit(Model(sensor, (), recording.plan), recording, np.zeros(7), law.with_least_sigma(NOISE_SD))
+    if not free:
+        return one
+    form = with_free_form(sensor)
+    start = np.pad(one.z, (0, form.n_params - sensor.n_params))
+    return fit(Model(form, (), recording.plan), recording, start, law.with_least_sigma(NOISE_SD))
+
+
+def usable(recording: Recording) -> np.ndarray:
+    return np.flatnonzero(recording.usable)
+
+
+def noise_free(spot, plan) -> Recording:
+    return Recording(plan, World(spot).expected_readings(plan))
+
+
+@pytest.mark.parametrize("plan", [paper_plan(), two_way_plan()], ids=["paper", "two_way"])
+def test_it_takes_up_what_a_free_form_leaves_of_a_ring(plan):
+    recording = noise_free(ring_spot(4.0, 1.2, center_mm=(0.0, 1.5), off_axis=0.4, pixel_mm=0.5), plan)
+    found = fitted(recording)
+    slopes = np.concatenate([found.slopes, fine_structure_slopes(found.model, found.z, usable(recording))], axis=1)
+    z = np.pad(found.z, (0, slopes.shape[1] - len(found.z)))
+    design = np.concatenate([slopes / NOISE_SD, np.eye(len(z))])
+    target = np.concatenate([found.residuals / NOISE_SD, -z])
+    left = np.linalg.norm(target - design @ np.linalg.lstsq(design, target, rcond=None)[0])
+    rest = float(np.linalg.norm(found.residuals) / NOISE_SD)
+    assert rest > 1.0  # something is left of a ring, in noise sds
+    assert np.sqrt(max(left**2 - np.sum(z**2), 0.0)) < 0.5 * rest
+
+
+def test_effects_outlast_it():
+    plan = two_way_plan()
+    world = World(gaussian_spot([Blob(1.0, (0.4, -0.3), (5.0, 3.5), 0.3)], pixel_mm=0.5))
+    rng = np.random.default_rng(7)
+    recording = Recording(plan, world.expected_readings(plan) + NOISE_SD * rng.standard_normal(len(plan)))
+    found = fitted(recording)
+    law = white_noise(len(recording))
+    extent = Extent.of(recording)
+    more = fine_structure_slopes(found.model, found.z, usable(recording))
+    without, beside = Linearised.of(found, law), Linearised.of(found, law, more)
+    for name in ("backlash", "lag", "sensor_tilt", "ambient_gradient", "glint", "battery_sag", "flicker"):
+        effect = VOCABULARY[name].for_extent(extent)
+        model = found.model.with_effect(effect)
+        z = np.concatenate([found.z, model.z_of_last_effect(effect.entries[0][:1])[0]])
+        change = (model.predict(z[None, :])[0] - found.model.predict(found.z[None, :])[0])[:, None]
+        kept = np.linalg.norm(beside.project(change)) / np.linalg.norm(without.project(change))
+        assert kept > 0.9, name

@@ -1,4 +1,4 @@
-"""A campaign: every task once, whatever the executor and whenever it was stopped."""
+"""A campaign: every task once, whatever the executor and whenever it was stopped; the subset of cells for CI."""
 
 import json
 import os
@@ -8,6 +8,7 @@ from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing import get_all_start_methods, get_context
 from pathlib import Path
 
+import matrix
 import pytest
 
 import probewise
@@ -148,3 +149,9 @@ def test_no_other_verb_loads_what_proves_the_package():
     others = [name.removesuffix(".__init__") for name in modules if not any(part in name for part in those)]
     code = f"import {', '.join(others)}, sys; sys.exit('probewise.proof' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+def test_the_subset_for_every_change_is_of_cells_that_exist():
+    keys = Path(matrix.__file__).with_name("matrix_ci.txt").read_text().splitlines()
+    assert len(keys) == len(set(keys)) > 40
+    assert set(keys) <= set(matrix.all_cells(52))

@@ -1,7 +1,11 @@
-"""What is written is what is read back, in full precision."""
+"""What is written is what is read back: recordings, plans that come ready, pictures; and locks."""
 
 import csv
 import math
+import os
+import signal
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -24,15 +28,21 @@ from probewise.recordings import (
     Stripes,
     Uniform,
     fingerprint,
+    hold_lock,
+    paper_plan,
     read_plan,
     read_plan_and_readings,
     read_prediction_columns,
     read_recording,
+    shipped,
+    two_way_plan,
+    write_bytes_atomically,
     write_plan,
     write_prediction,
     write_recording,
 )
 from probewise.recordings.files import shortest_degrees
+from probewise.recordings.plans import with_jittered_times
 from probewise.recordings.table import csv_text, read_table
 
 numbers = st.floats(-1e6, 1e6)
@@ -262,3 +272,104 @@ def test_texts_that_a_spreadsheet_would_compute_are_written_so_that_it_does_not_
     table = read_table(path)
     assert list(table.columns) == ["=column", "n"]
     assert table.columns["=column"] == list(cells)
+
+
+def test_the_paper_plan_is_the_papers():
+    """Paper, "Data Collection for SSF Estimation": four scans of 101 places, then four quadrants."""
+    plan = paper_plan()
+    assert len(plan) == 408
+    assert plan.scan_names == ("edge_0", "edge_90", "edge_180", "edge_270", "quadrants")
+    rows = plan.rows_by_scan()
+    assert [len(r) for r in rows] == [101, 101, 101, 101, 4]
+    np.testing.assert_array_equal(plan.x_mm[rows[2]], np.arange(-50, 51))
+    np.testing.assert_allclose(plan.orientation_rad[[r[0] for r in rows]], np.radians([0, 90, 180, 270, 0]))
+    assert [plan.pattern_names[k] for k in plan.pattern[rows[4]]] == [f"quadrant_{c}" for c in "abcd"]
+    quadrants = [plan.patterns[f"quadrant_{c}"] for c in "abcd"]
+    assert [quadrant.corner_mm for quadrant in quadrants] == [(0, 0), (0, 0), (4, 4), (-4, 4)]
+    assert [quadrant.direction for quadrant in quadrants] == [(1, 1), (-1, 1), (1, 1), (-1, 1)]
+    np.testing.assert_array_equal(plan.direction_of_motion[rows[0]], np.tile([1.0, 0.0], (101, 1)))
+    np.testing.assert_array_equal(plan.direction_of_motion[rows[4]], 0)
+    np.testing.assert_allclose(np.diff(plan.time_s[rows[0]]), 1.2)
+
+
+def test_the_two_way_plan_goes_both_ways_in_every_orientation():
+    plan = two_way_plan()
+    assert len(plan) == 961
+    for deg in (0, 90, 180, 270):
+        out, back = (plan.rows_by_scan()[plan.scan_names.index(f"edge_{deg}_{way}")] for way in ("out", "back"))
+        np.testing.assert_array_equal(plan.x_mm[out], plan.x_mm[back][::-1])
+        assert plan.direction_of_motion[out[0], 0] == 1
+        assert plan.direction_of_motion[back[0], 0] == -1
+        fast = 2 if deg >= 180 else 1
+        np.testing.assert_allclose(np.diff(plan.time_s[out])[0], fast * np.diff(plan.time_s[back])[0])
+    assert set(plan.pattern_names) >= {"white", "black", "disc"}
+    np.testing.assert_array_equal(plan.direction_of_motion[-1], [0, -1])
+    assert np.all(np.diff(plan.time_s) > 0)
+
+
+def test_jitter_keeps_the_order_and_the_pace():
+    plan = two_way_plan()
+    taken = with_jittered_times(plan, rng=np.random.default_rng(1))
+    ratio = np.diff(taken.time_s) / np.diff(plan.time_s)
+    assert ratio.min() > 0.899
+    assert ratio.max() < 1.101
+    assert ratio.std() > 0.05
+    assert taken.covariates["battery_mv"][-1] < taken.covariates["battery_mv"][0] - 100
+
+
+def test_a_recording_that_does_not_ship_is_refused():
+    with pytest.raises(ParameterError, match="'paper' or 'concealed'"):
+        shipped("other")
+
+
+HOLD = """
+import sys, time
+from probewise._writing import hold_lock
+with hold_lock(sys.argv[1]):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_a_second_process_is_refused_and_a_killed_holder_holds_it_no_more(tmp_path):
+    path = tmp_path / "journal.jsonl"
+    with subprocess.Popen([sys.executable, "-c", HOLD, path], stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout.readline() == "held\n"
+        with pytest.raises(FileError, match=r"journal.jsonl: another process is writing to it"), hold_lock(path):
+            pass
+        other.send_signal(signal.SIGKILL if os.name != "nt" else signal.SIGTERM)
+        other.wait()
+    with hold_lock(path, patience_s=10):
+        pass
+    assert [p.name for p in tmp_path.iterdir()] == [".journal.jsonl.lock"]
+
+
+def test_a_folder_that_is_missing_is_named(tmp_path):
+    with pytest.raises(FileError, match=r"nowhere.*cannot be written"), hold_lock(tmp_path / "nowhere" / "a"):
+        pass
+
+
+def test_what_a_killed_writer_left_is_removed_by_the_next_and_what_a_living_one_holds_is_not(tmp_path):
+    (tmp_path / ".a.01234567.part").write_text("half")
+    (tmp_path / ".b.other.part").write_text("of another name")
+    with (tmp_path / ".a.89abcdef.part").open("w") as living:
+        if os.name != "nt":
+            import fcntl
+
+            fcntl.flock(living, fcntl.LOCK_EX)
+        write_bytes_atomically(tmp_path / "a", b"whole")
+        assert {p.name for p in tmp_path.iterdir()} == {"a", ".a.89abcdef.part", ".b.other.part"}
+    write_bytes_atomically(tmp_path / "a", b"again")
+    assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == {"a": b"again", ".b.other.part": b"of another name"}
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has links for administrators only")
+def test_a_lock_file_that_is_a_symbolic_link_is_refused_and_where_it_leads_stays_as_it_is(tmp_path):
+    (tmp_path / "victim").write_text("precious")
+    for target in ("victim", "to be made"):
+        (tmp_path / ".a.lock").unlink(missing_ok=True)
+        (tmp_path / ".a.lock").symlink_to(tmp_path / target)
+        with pytest.raises(FileError, match=r"\.a\.lock: cannot be locked \(is a sym"), hold_lock(tmp_path / "a"):
+            pass
+    assert {p.name for p in tmp_path.iterdir()} == {".a.lock", "victim"}
+    assert (tmp_path / "victim").read_text() == "precious"

@@ -1,7 +1,8 @@
-"""The table of a challenge on systems, from results made by hand."""
+"""One case of a system, and the table of a challenge on systems, from results made by hand."""
 
 import pytest
 
+from probewise.proof.challenge import challenge, run_system_case
 from probewise.proof.pages import challenge_page
 from probewise.proof.tables import gains_on_held_out_runs, score_systems
 from probewise.report.html import draw_or_raise
@@ -114,3 +115,16 @@ def test_the_page_tells_every_case():
     text = challenge_page(results, score_systems, command="probewise challenge", systems=True).html(draw_or_raise)
     for expected in ("drifts:k", "strange_switch:u", "ParameterError: no", "right covariate first, lambda 12"):
         assert expected in text
+
+
+@pytest.mark.slow
+def test_a_case_is_diagnosed_from_its_files_and_the_campaign_goes_on(tmp_path):
+    path = tmp_path / "cases.jsonl"
+    first, both = (
+        list(challenge(range(n), seed=5, work=run_system_case, of="systems").run(path=path).values()) for n in (1, 2)
+    )
+    assert both[0] == first[0]
+    assert "failed" not in both[0]
+    assert set(both[0]["held_out"]) == {"inside", "beyond"}
+    assert len(path.read_text().splitlines()) == 3
+    assert any(row.found.n for row in score_systems(both))

@@ -1,10 +1,29 @@
-"""The simulated arm as an instrument: reach, clock, scale."""
+"""Plans carried out by the simulated arm, and the check of its height over sheets."""
+
+import dataclasses
+import math
 
 import numpy as np
 import pytest
 
-from probewise.arm import Pose, Reach, Reading, ReadingScale, SimulatedArm, Speed
+from probewise.arm import (
+    DryRun,
+    LegoArm,
+    Pose,
+    Reach,
+    Reading,
+    ReadingScale,
+    SimulatedArm,
+    Speed,
+    carry_out,
+    read_geometry,
+    readings_of_recording,
+    recording_of_readings,
+    shipped_geometry_path,
+)
+from probewise.arm.fitting import check_heights
 from probewise.errors import ParameterError, ReachError, ShapeError
+from probewise.recordings import paper_plan
 
 HERE = Pose(500.0, 200.0)
 
@@ -99,3 +118,73 @@ def test_leaving_the_block_brings_the_arm_to_rest_after_an_exception_too():
 def test_an_arm_without_sense_is_refused(make, error, message):
     with pytest.raises(error, match=message):
         make()
+
+
+GEOMETRY = read_geometry(shipped_geometry_path())
+ORIGIN = (524.0, 260.0)
+
+
+class Told:
+    """A machine of words, and the person beside it."""
+
+    def __init__(self):
+        self.asked = []
+        self.arm = LegoArm(DryRun(GEOMETRY, lambda text: None), GEOMETRY)
+
+    def take(self, plan, **options):
+        with self.arm:
+            return list(carry_out(self.arm, plan, origin_mm=ORIGIN, ask=self.asked.append, **options))
+
+
+@pytest.fixture
+def told():
+    return Told()
+
+
+def test_a_plan_that_the_arm_cannot_reach_moves_nothing(told):
+    plan = paper_plan()
+    with pytest.raises(
+        ReachError, match=r"row 1 of the plan \(mm\) is \(-26.0, 20.0\);.*\d+ are in reach; move the plan"
+    ):
+        list(carry_out(told.arm, plan, origin_mm=(24.0, 20.0), ask=told.asked.append))
+    assert not told.asked
+
+
+def test_what_a_plan_commands_stays_in_rows_that_are_read_after_a_resumption():
+    rows = paper_plan().take(np.arange(4))
+    plan = dataclasses.replace(rows, covariates={"led": np.ones(4)})
+    readings = [Reading(40.0, Pose(0.0, 0.0), float(k)) for k in range(4)]
+    resumed = [*readings_of_recording(recording_of_readings(plan, readings[:2])), *readings[2:]]
+    assert recording_of_readings(plan, resumed).plan.covariates["led"].tolist() == [1.0] * 4
+
+
+HEIGHTS = np.arange(14.0, 23.0).tolist()
+LAWS = {
+    "square": lambda h: 60.0 * (14.0 / h) ** 2,
+    "beside a room's light": lambda h: 25.0 + 35.0 * (14.0 / h) ** 2,
+    "behind its peak": lambda h: 95.0 * h / 8 * math.exp(1 - h / 8),
+}
+
+
+def looks(law, heights, *, off_mm=0.0, noise=0.0, rng=None):
+    return np.array(
+        [(h, law(h + off_mm) + (noise * rng.standard_normal() if rng else 0.0), noise or 0.02) for h in heights]
+    )
+
+
+@pytest.mark.parametrize("law", LAWS.values(), ids=LAWS)
+@pytest.mark.parametrize("off_mm", [-1.0, 0.4])
+def test_a_sensor_that_hangs_elsewhere_is_told_by_how_much(law, off_mm):
+    curve = looks(law, HEIGHTS)
+    found = check_heights(curve, looks(law, [14.0, 14.3], off_mm=off_mm))
+    np.testing.assert_allclose(found.off_mm, off_mm, atol=0.2 * abs(off_mm))
+    assert np.sign(found.off_mm).tolist() == [math.copysign(1, off_mm)] * 2
+
+
+def test_light_that_does_not_fall_with_the_height_tells_nothing():
+    flat = looks(lambda h: 30.0, [14.0, 17.0, 20.0])
+    with pytest.raises(ParameterError, match="is the LED lit"):
+        check_heights(flat, looks(lambda h: 30.0, [14.0]))
+    rising = looks(lambda h: 10.0 * h, [14.0, 17.0, 20.0])
+    with pytest.raises(ParameterError, match="fall with the height"):
+        check_heights(rising, looks(lambda h: 30.0, [14.0]))

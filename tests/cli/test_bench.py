@@ -1,11 +1,17 @@
-"""`arm scan` and `arm record` with arms of arithmetic: patterns lie down and the sensor is turned by nobody."""
+"""`arm scan` and `arm record` with arms of arithmetic, whose sensor nobody turns; gears of unknown play."""
+
+import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 from command import run
 
+from probewise.arm import Pose, read_geometry, shipped_geometry_path
 from probewise.calibration import predict, read_sensor
-from probewise.recordings import Plan, Ramp, Uniform, paper_plan, read_recording, write_plan
+from probewise.cli._bench import open_emulated_arm_and_bench
+from probewise.recordings import Disc, Plan, Ramp, Uniform, paper_plan, read_recording, write_plan
+from probewise.world.shipped import true_world
 
 
 def test_a_ramp_is_laid_where_its_origin_is_to_lie(tmp_path):
@@ -61,3 +67,47 @@ def test_a_scan_goes_over_what_lies_there(arm, capsys):
     assert run("arm", "scan", "500,250", "600,250", "--readings", "2", "--arm", arm, "--scene", "600,250,60") == 0
     _, dark, bright = capsys.readouterr().out.splitlines()
     assert float(dark.split(",")[4]) < 20 < 50 < float(bright.split(",")[4])
+
+
+SHIPPED = read_geometry(shipped_geometry_path())
+KNOWN_DEG = 0.3
+BASE_MM = (524.0, 580.0)
+
+
+def built_with(play_deg, path):
+    text = Path(shipped_geometry_path()).read_text(encoding="utf-8")
+    known = f"play_deg = {KNOWN_DEG}"
+    assert text.count(known) == 1
+    path.write_text(text.replace(known, f"play_deg = {play_deg}"), encoding="utf-8")
+    return path
+
+
+def turned_deg(play_deg, path):
+    """How far the base stands from where the driver believes it, at places that it comes to from both sides."""
+    arm, bench = open_emulated_arm_and_bench(
+        SHIPPED, built_with(play_deg, path), true_world("paper"), Disc((500.0, 250.0), 90.0), seed=1, start_s=0.0
+    )
+    angle = np.random.default_rng(0).uniform(0, 2 * np.pi, 8)
+    places = np.stack([BASE_MM[0] + 200 * np.cos(angle), 200 + 120 * np.sin(angle)], axis=1)
+    off, from_below, before = [], [], -90.0
+    with arm:
+        for x_mm, y_mm in places:
+            (orientation_rad,) = arm.orientation_rad(np.array([[x_mm, y_mm]]))
+            at = arm.measure(Pose(float(x_mm), float(y_mm), float(orientation_rad))).pose
+            stand = bench.arm.sensor_pose()
+            believed, true = (
+                math.degrees(math.atan2(here.y_mm - BASE_MM[1], here.x_mm - BASE_MM[0])) for here in (at, stand)
+            )
+            off.append(true - believed)
+            from_below.append(believed > before)
+            before = believed
+    return np.array(off), np.array(from_below)
+
+
+@pytest.mark.parametrize("play_deg", [KNOWN_DEG, 1.5, 2.5])
+def test_play_that_the_approach_takes_up_turns_the_arm_by_half_of_what_is_not_known(play_deg, tmp_path):
+    """To within two counts of the motor, 0.1 degrees of the base."""
+    off, from_below = turned_deg(play_deg, tmp_path / "true.toml")
+    assert from_below.any()
+    assert not from_below.all()
+    np.testing.assert_allclose(off, -(play_deg - KNOWN_DEG) / 2, atol=0.1)

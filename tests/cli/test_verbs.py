@@ -6,13 +6,17 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jsonschema
 import numpy as np
 import pytest
 from command import run
 
 from probewise import __version__
 from probewise.calibration import predict, read_sensor
-from probewise.cli import VERBS
+from probewise.cli import VERBS, main
+from probewise.diagnosis import diagnosis_schema
+from probewise.effects import VOCABULARY
+from probewise.errors import NotConvergedError
 from probewise.recordings import read_plan, read_plan_and_readings, read_prediction_columns
 from probewise.report import exploration
 
@@ -142,3 +146,63 @@ def test_the_demo_does_all_of_it(tmp_path, capsys):
     assert "SSF" in said
     assert "concealed was" in said
     assert (out / "report.html").stat().st_size > 100_000
+
+
+@pytest.mark.slow
+def test_a_fit_that_does_not_arrive_gives_no_verdict(recording_file, tmp_path, monkeypatch, capsys):
+    def never(*_, **__):
+        raise NotConvergedError("the fit of the model did not converge")
+
+    monkeypatch.setattr("probewise.diagnosis.verdict.require_converged_fit", never)
+    assert run("diagnose", recording_file, "--out", tmp_path / "out") == 1
+    said = capsys.readouterr()
+    assert said.err.splitlines()[-1] == "probewise diagnose: the fit of the model did not converge"
+    assert said.out == ""
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_a_thorough_diagnosis_states_both_evidences(recording_file, sensor_file, tmp_path):
+    out = tmp_path / "out"
+    given = ["diagnose", recording_file, "--sensor", sensor_file, "--thorough", "--out", out, "--quiet"]
+    assert main([str(word) for word in given]) == 0
+    document = json.loads((out / "diagnosis.json").read_text(encoding="utf-8"))
+    jsonschema.validate(document, diagnosis_schema())
+    assert [] in [weighed["effects"] for weighed in document["thorough"]]
+    assert all(weighed["agree"] for weighed in document["thorough"])
+    assert document["reason"].endswith("nested sampling agrees to within a nat plus its standard error.")
+    assert "ln Z, nested sampling" in (out / "report.html").read_text(encoding="utf-8")
+
+
+def no_constant(name):
+    raise ValueError(f"{name} is no JSON number")
+
+
+@pytest.mark.slow
+def test_an_audit_names_the_aliases_of_one_way_scans_and_the_scans_that_cure_them(recording_file, tmp_path, capsys):
+    out = tmp_path / "new" / "audit"
+    assert run("audit", recording_file, "--out", out) == 0
+    said = capsys.readouterr().out
+    assert len(said.splitlines()) <= 25
+    found = json.loads((out / "audit.json").read_text(), parse_constant=no_constant)
+    effects = {effect["name"]: effect for effect in found["effects"]}
+    assert set(effects) == set(VOCABULARY)
+    assert effects["hysteresis"]["sight"] == "invisible"
+    assert "edge_misplacement" in {like["effect"] for like in effects["backlash"]["alike"]}
+    cure = found["cure"]
+    assert cure["readings"] == len(read_plan(out / cure["plan"])) == sum(s["readings"] for s in cure["scans"])
+    cured = {name for scan in cure["scans"] for name in scan["cures"]}
+    after = {effect["name"]: effect["sight"] for effect in found["after"]}
+    assert "lag" in cured
+    assert all(after[name] == "fine" for name in cured)
+    assert (out / "audit.png").read_bytes().startswith(b"\x89PNG")
+    assert "more fine" in (out / "report.html").read_text()
+
+
+@pytest.mark.slow
+def test_without_a_directory_nothing_is_written(recording_file, tmp_path, capsys):
+    recording_file.write_text("\n".join(recording_file.read_text().splitlines()[:27]) + "\n")
+    before = sorted(tmp_path.rglob("*"))
+    assert run("audit", recording_file) == 0
+    assert "backlash" in capsys.readouterr().out
+    assert sorted(tmp_path.rglob("*")) == before

@@ -133,22 +133,6 @@ RUN = np.repeat(np.arange(6.0), N // 6)
 DRIVE = np.tile(np.linspace(0.2, 2.0, N // 6), 6)
 
 
-def drawn_of_linear_posterior(gains, seed):
-    """Samples of one gain per run, about a fit under white noise, and what least squares says of each run."""
-    rng = np.random.default_rng(seed)
-    y = 2.0 * DRIVE * (1 + np.asarray(gains)[RUN.astype(int)]) + SD * rng.normal(size=N)
-    table = RunTable({"run": RUN, "drive": DRIVE, "y": y}, run="run")
-    simulator = Simulator("y", "V", {"zero": (-1, 1)}, simulate=lambda p, u: p["zero"] + 2.0 * u["drive"], run="run")
-    prepared = prepare_system(simulator, table)
-    (each_its_own,) = prepared.effects["gain_per_run"].alternatives
-    model = Model(prepared.null, (each_its_own,), prepared.recording.plan)
-    found = fit(model, prepared.recording, np.zeros(model.n_params), white_noise(N))
-    evidence = laplace_evidence(found, NoiseModel((), prepared.recording, least_sd=1e-3))
-    weights = {"gain_per_run": np.ones(1)}
-    samples = sample_model(found, evidence, prepared.recording, weights=weights, rng=rng, laplace_only=True)
-    return found, samples.effect_samples("gain_per_run"), y
-
-
 @pytest.mark.parametrize("laplace_only", [False, True])
 def test_values_of_one_size_leave_open_what_they_have_in_common(laplace_only):
     """By numbers: a mean with a wide prior and values of one sd; given the sd, all are jointly normal."""

@@ -127,12 +127,6 @@ def test_the_robot_asks_fifty_circles_and_goes_where_their_answers_differ_most(s
     assert [chosen.x_mm, chosen.y_mm] in places[best_designs_mask(steps[0].map.values, steps[0].map.reachable)].tolist()
 
 
-def same(a, b):
-    return (a.reading, a.next_pose, a.bits, a.log_z) == (b.reading, b.next_pose, b.bits, b.log_z) and (
-        a.samples == b.samples
-    ).all()
-
-
 def test_a_journal_of_one_method_is_not_gone_on_with_by_another(small, tmp_path):
     journal = tmp_path / "journal.jsonl"
     run(small.arm(), small.experiment(likelihood=STUDENT, method=QUICK), rng=rng(), max_readings=1, journal=journal)

@@ -1,4 +1,4 @@
-"""Kinds of hypotheses weighed against each other at every reading, against sums over a lattice of all hypotheses."""
+"""The posterior carried from reading to reading, and over kinds, against sums over a lattice of hypotheses."""
 
 import math
 from dataclasses import replace
@@ -6,11 +6,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.special import logsumexp
+from scipy.stats import multivariate_normal
 
 from probewise.arm.instrument import Pose, Reading
 from probewise.errors import NotConvergedError
+from probewise.experiment.evidence import sampled_about_points
 from probewise.experiment.kinds import prior_posterior
 from probewise.experiment.method import SequentialMonteCarlo
+from probewise.inquiry.smc import (
+    THOROUGH,
+    LocalKernels,
+    Particles,
+    _EvaluatedSamples,
+    _move_by_metropolis,
+    prior_particles,
+    update,
+)
+from probewise.nested import run
 from probewise.scene import AnyOf
 
 # The lead changes four times.
@@ -176,3 +188,167 @@ def test_samples_that_lost_nothing_stay_as_they_are(small):
     again = checked(now, recording)
     assert again.particles[0].weighted is now.particles[0].weighted
     assert checked(again, recording).particles[0] is again.particles[0]  # it was checked just now
+
+
+READINGS_OF_PARTICLES = [
+    (120.0, 80.0, 10.3),
+    (300.0, 200.0, 9.6),
+    (250.0, 140.0, 59.2),
+    (250.0, 203.0, 36.0),
+    (190.0, 140.0, 41.5),
+]
+
+
+def never():
+    raise AssertionError("no reading here is a surprise")
+
+
+def noisy(small):
+    return small.experiment(likelihood=small.gaussian(4.0), noise_sd=4.0)
+
+
+def problem_of(small, n):
+    """Noise of 4 units, so that a lattice of 2 mm can add up what is as sharp as 1.6 mm."""
+    return noisy(small).problem([Reading(v, Pose(x, y), 0.0) for x, y, v in READINGS_OF_PARTICLES[:n]])
+
+
+def particles(small, *, n_particles=3000, seed=0, steps=5, fall_back=never):
+    random = rng(seed)
+    found = prior_particles(problem_of(small, 0).prior, n_particles, rng=random)
+    for n in range(1, steps + 1):
+        found = update(found, problem_of(small, n), rng=random, fall_back=fall_back)
+    return found
+
+
+def carried(small, **options):
+    return particles(small, **options).weighted
+
+
+@pytest.fixture(scope="module")
+def lattice():
+    """Every hypothesis of the small prior at 2 mm: x, y, radius."""
+    axes = np.meshgrid(np.arange(1, 400, 2.0), np.arange(1, 300, 2.0), np.arange(21, 150, 2.0), indexing="ij")
+    return np.stack([axis.ravel() for axis in axes], axis=1)
+
+
+def by_lattice_of_particles(small, lattice, n):
+    """log Z, mean and sd by adding up; see `problem_of`."""
+    problem = problem_of(small, n)
+    log_likelihood = np.concatenate([problem.log_likelihood(part) for part in np.array_split(lattice, 100)])
+    weight = np.exp(log_likelihood - log_likelihood.max())
+    weight /= weight.sum()
+    mean = weight @ lattice
+    return float(logsumexp(log_likelihood)) - math.log(len(lattice)), mean, np.sqrt(weight @ (lattice - mean) ** 2)
+
+
+@pytest.mark.parametrize("n", [2, *(pytest.param(n, marks=pytest.mark.slow) for n in (4, 5))])
+def test_evidence_and_moments_are_those_of_adding_up_all_hypotheses(small, lattice, n):
+    """log Z within five of its stated errors (0.05 besides, for the lattice); means within 15 % of the sds."""
+    posterior = carried(small, steps=n)
+    log_z, mean, sd = by_lattice_of_particles(small, lattice, n)
+    assert posterior.log_z == pytest.approx(log_z, abs=5 * posterior.log_z_error + 0.05)
+    np.testing.assert_allclose(posterior.mean(), mean, atol=0.15 * sd.max())
+    np.testing.assert_allclose(posterior.sd(), sd, rtol=0.12)
+
+
+@pytest.mark.slow
+def test_the_stated_error_of_the_evidence_is_its_scatter(small):
+    """Twelve seeds: a chi-square of 11 degrees of freedom, 1e-4 on either side, and a factor for correlations."""
+    runs = [carried(small, n_particles=600, seed=seed) for seed in range(12)]
+    z = (np.array([r.log_z for r in runs]) - np.mean([r.log_z for r in runs])) / np.array([r.log_z_error for r in runs])
+    assert 1.6 < (z**2).sum() < 4 * 36.0
+
+
+def test_a_reading_that_keeps_the_samples_has_each_predict_once(small):
+    problem, asked = problem_of(small, 1), []
+
+    class Counted:
+        names = problem.model.names
+
+        def predict(self, theta, plan):
+            asked.append(len(theta))
+            return problem.model.predict(theta, plan)
+
+    start = prior_particles(problem.prior, 300, rng=rng())
+    kept = update(start, replace(problem, model=Counted()), rng=rng(), fall_back=never)
+    np.testing.assert_array_equal(kept.weighted.theta, start.weighted.theta)
+    assert asked == [300]
+    assert kept.weighted.n_calls == 300
+
+
+def test_a_reading_that_surprises_is_taken_in_from_scratch(small):
+    """A posterior certain of the left half, then a reading on white in the right one."""
+    problem = problem_of(small, 3)
+    theta = problem.prior.from_unit_cube(rng().random((500, 3)))
+    theta[:, 0] *= 0.2
+    even = np.full(500, -math.log(500))
+    start = prior_particles(problem.prior, 500, rng=rng()).weighted
+    certain = type(start)(start.names, theta, np.zeros(500), even, 0.0, 0.0, 500.0, 0, -math.inf)
+    before = Particles(certain, np.arange(500))
+    assert update(before, problem, rng=rng(1)).strained
+    found = update(before, problem, rng=rng(1), fall_back=lambda: run(problem, rng=rng(2), n_live=100)).weighted
+    assert found.run is not None
+    assert found.log_z == found.run.log_z
+    assert found.mean()[0] == pytest.approx(250.0, abs=40.0)
+    assert len(found.theta) == 500
+
+
+def test_a_missing_reading_changes_nothing(small):
+    before = particles(small, n_particles=300, steps=3)
+    readings = [Reading(v, Pose(x, y), 0.0) for x, y, v in READINGS_OF_PARTICLES[:3]]
+    problem = noisy(small).problem([*readings, Reading(math.nan, Pose(10.0, 10.0), 1.0)])
+    after = update(before, problem, rng=rng(), fall_back=never)
+    np.testing.assert_allclose(after.weighted.log_weight, before.weighted.log_weight)
+    assert after.log_z == pytest.approx(before.log_z)
+
+
+@pytest.mark.slow
+def test_what_is_redrawn_has_its_shares_from_the_readings_not_from_where_it_began(small, lattice):
+    """Nine in ten of the points are of the half of the posterior where the centre is to the left of its mean."""
+    posterior, problem = carried(small, steps=4, fall_back=None), problem_of(small, 4)
+    log_z, mean, sd = by_lattice_of_particles(small, lattice, 4)
+    points = posterior.samples(2000, rng=rng(1))
+    left = points[:, 0] < mean[0]
+    uneven = np.concatenate([points[left], points[~left][: left.sum() // 9]])
+    found = sampled_about_points(uneven, problem, 8000, rng(2))
+    assert found.mean()[0] == pytest.approx(mean[0], abs=0.15 * sd[0])
+    assert found.log_z == pytest.approx(log_z, abs=5 * found.log_z_error + 0.05)
+
+
+def test_the_genealogy_tells_when_few_samples_at_the_start_are_ancestors_of_all(small):
+    many = particles(small, n_particles=600, fall_back=None)
+    few = replace(many, ancestor=many.ancestor % 4)
+    assert many.log_z_error < 0.3
+    assert few.log_z_error > 0.4
+
+
+def test_kernels_have_the_density_of_the_gaussians_they_draw_from():
+    """Two routes to the density: the product of features, and scipy's for each kernel."""
+    points = rng().normal(size=(400, 3)) * [30.0, 1.0, 8.0] + [500.0, 200.0, 80.0]
+    kernels = LocalKernels.fitted_to(points, rng=rng(1))
+    at = kernels.draw(50, rng=rng(2))
+    each = [
+        multivariate_normal(kernels.origin + centre, root @ root.T).pdf(at)
+        for centre, root in zip(kernels.centre, kernels.root, strict=True)
+    ]
+    np.testing.assert_allclose(kernels.log_density(at), np.log(np.mean(each, axis=0)), atol=1e-4)
+
+
+def test_samples_that_have_collapsed_on_a_point_still_have_kernels_about_it():
+    """Samples that differ by rounding error alone, one coordinate not at all, had a covariance without a root."""
+    exact = np.array([577.0, 357.0, 97.0, 0.0354365305, 0.0])
+    points = exact + 1e-16 * exact * rng().integers(-20, 20, size=(500, 5))
+    kernels = LocalKernels.fitted_to(points, rng=rng(1))
+    drawn = kernels.draw(100, rng=rng(2))
+    np.testing.assert_allclose(drawn, np.broadcast_to(exact, drawn.shape), rtol=1e-6, atol=1e-90)
+    assert np.isfinite(kernels.log_density(drawn)).all()
+
+
+def test_copies_of_one_sample_are_not_moved(small):
+    """They are left where they are, and the posterior is marked as strained."""
+    problem = small.experiment().problem([Reading(40.0, Pose(50.0, 30.0, 0.0), 1.0)])
+    theta = np.repeat(problem.prior.from_unit_cube(np.full((1, len(problem.prior.names)), 0.5)), 60, axis=0)
+    start = _EvaluatedSamples.of(theta, problem, 1.0)
+    moved, accepted, _ = _move_by_metropolis(start, 1.0, problem, rng(1), [np.arange(len(theta))], THOROUGH)
+    assert accepted == 0.0
+    np.testing.assert_array_equal(moved.theta, theta)

@@ -1,10 +1,8 @@
 """Files made to break a reader: exit status 2, one short line, nothing written, and soon."""
 
-from functools import partial
-
-import command
 import numpy as np
 import pytest
+from command import refused
 
 from probewise.arm import shipped_geometry_path
 from probewise.cli import main
@@ -22,6 +20,13 @@ TEXTS = {
     "nothing": b"",
 }
 SOME_TEXTS = ("an integer of 5000 digits", "lists a million deep", "NaN", "random bytes", "a list", "nothing")
+
+
+def after(first):
+    """Some texts as a file of lines holds them, by themselves and after its first line."""
+    return {f"{name}{' after a line' * bool(a)}": a + TEXTS[name] + b"\n" for a in (b"", first) for name in SOME_TEXTS}
+
+
 TABLES = {
     "200,000 cells in one line": b",".join([b"a"] * 200_000),
     "ten thousand columns": b",".join(b"c%d" % k for k in range(10_000)) + b"\n" + b",".join([b"1"] * 10_000),
@@ -35,49 +40,28 @@ TABLES = {
 }
 
 
-@pytest.fixture
-def refused(tmp_path, capsys):
-    return partial(command.refused, capsys, tmp_path)
+JOURNAL, CAMPAIGN = b'{"format": "journal/1"}\n', b'{"format": "campaign/1", "settings": {}}\n'
+SHIPPED = shipped_geometry_path().read_text().encode()
+X_MM = SHIPPED.index(b"= ", SHIPPED.index(b"\nx_mm")) + 2
+NUMBERS = {"a huge number": b"9" * 400, "deep lists": b"[" * 100_000, "a huge text": b'"' + b"a" * 100_000 + b'"'}
+GEOMETRIES = {name: SHIPPED[:X_MM] + n + SHIPPED[SHIPPED.index(b"\n", X_MM) :] for name, n in NUMBERS.items()}
+READERS = {  # by command its file, and what that may hold
+    "predict bad.json small.csv --out p.csv": ("bad.json", TEXTS),
+    "diagnose bad.jsonl --sensor sensor.json --out out": ("bad.jsonl", after(JOURNAL)),
+    "challenge --out .": ("cases.jsonl", after(CAMPAIGN)),
+    "study --out .": ("trials.jsonl", after(CAMPAIGN)),
+    "arm check --geometry bad.toml": ("bad.toml", TEXTS | GEOMETRIES),
+    "emulate-nxt --geometry bad.toml": ("bad.toml", TEXTS | GEOMETRIES),
+    "diagnose small.csv --out out --quiet": ("small.csv", TABLES),
+}
 
 
-@pytest.mark.parametrize("what", TEXTS)
-def test_a_sensor_that_is_no_sensor_is_refused(what, refused, recording_file, tmp_path):
-    (tmp_path / "bad.json").write_bytes(TEXTS[what])
-    said = refused("predict", tmp_path / "bad.json", recording_file, "--out", tmp_path / "p.csv")
-    assert "bad.json" in said
-
-
-@pytest.mark.parametrize("what", SOME_TEXTS)
-@pytest.mark.parametrize("first", [b"", b'{"format": "journal/1"}\n'])
-def test_a_journal_that_is_none_is_refused(what, first, refused, sensor_file, tmp_path):
-    (tmp_path / "bad.jsonl").write_bytes(first + TEXTS[what] + b"\n")
-    said = refused("diagnose", tmp_path / "bad.jsonl", "--sensor", sensor_file, "--out", tmp_path / "out")
-    assert "bad.jsonl" in said
-
-
-@pytest.mark.parametrize("what", SOME_TEXTS)
-@pytest.mark.parametrize("first", [b"", b'{"format": "campaign/1", "settings": {}}\n'])
-@pytest.mark.parametrize(("verb", "name"), [("challenge", "cases.jsonl"), ("study", "trials.jsonl")])
-def test_a_campaign_that_is_none_is_refused(verb, name, first, what, refused, tmp_path):
-    (tmp_path / name).write_bytes(first + TEXTS[what] + b"\n")
-    assert name in refused(verb, "--out", tmp_path)
-
-
-@pytest.mark.parametrize("what", [*TEXTS, "a huge number", "deep lists", "a huge text"])
-def test_a_geometry_that_is_none_is_refused(what, refused, tmp_path):
-    shipped = shipped_geometry_path().read_text().encode()
-    instead = {"a huge number": b"9" * 400, "deep lists": b"[" * 100_000, "a huge text": b'"' + b"a" * 100_000 + b'"'}
-    at = shipped.index(b"= ", shipped.index(b"\nx_mm")) + 2
-    harmed = shipped[:at] + instead[what] + shipped[shipped.index(b"\n", at) :] if what in instead else TEXTS[what]
-    (tmp_path / "bad.toml").write_bytes(harmed)
-    assert "bad.toml" in refused("arm", "check", "--geometry", tmp_path / "bad.toml")
-    assert "bad.toml" in refused("emulate-nxt", "--geometry", tmp_path / "bad.toml")
-
-
-@pytest.mark.parametrize("what", TABLES)
-def test_a_table_that_is_none_is_refused(what, refused, recording_file, tmp_path):
-    recording_file.write_bytes(TABLES[what])
-    assert "small.csv" in refused("diagnose", recording_file, "--out", tmp_path / "out", "--quiet")
+@pytest.mark.parametrize(("command", "what"), [(words, what) for words, (_, own) in READERS.items() for what in own])
+def test_what_cannot_be_read_is_refused(command, what, recording_file, sensor_file, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    name, contents = READERS[command]
+    (tmp_path / name).write_bytes(contents[what])
+    assert name in refused(capsys, tmp_path, *command.split())
 
 
 def test_a_byte_order_mark_is_taken_wherever_text_is_read(sensor_file, tmp_path, capsys):

@@ -55,39 +55,37 @@ class InThisProcess(Executor):
 
 
 @pytest.fixture
-def short_study(monkeypatch):
-    """A study of few concealed effects."""
+def folder(monkeypatch, tmp_path, recording_file, sensor_file):
+    """What the commands read, where they run; a study is of few concealed effects, and no browser opens."""
+    (tmp_path / "heater.py").write_text(FILE)
+    (tmp_path / "data.csv").write_text(run_table_csv(runs(rng=np.random.default_rng(2))))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("webbrowser.open", lambda url: None)
     monkeypatch.setattr("probewise.cli._executor.worker_pool", lambda n: InThisProcess())
     few = partial(concealed_study.concealed_study, effects=("backlash", "saturation"))
     monkeypatch.setattr(concealed_study, "concealed_study", few)
+    return tmp_path
 
 
 QUICK = ("audit data.csv", "explore", "study --circles")
 
 
-@pytest.mark.usefixtures("short_study")
 @pytest.mark.parametrize(
     "command", [pytest.param(words, marks=[] if words.startswith(QUICK) else pytest.mark.slow) for words in COMMANDS]
 )
-def test_a_command_that_cannot_draw_writes_the_rest_says_so_in_a_line_and_exits_1(
-    command, recording_file, sensor_file, tmp_path, monkeypatch, capsys
-):
+def test_a_command_that_cannot_draw_writes_the_rest_says_so_in_a_line_and_exits_1(command, folder, monkeypatch, capsys):
     def fail(*_, **__):
         raise KeyError(0.0)
 
     monkeypatch.setattr(FigureCanvasAgg, "draw", fail)
     monkeypatch.setattr(FigureCanvasSVG, "print_svg", fail)
     axes_of_frame.cache_clear()  # with what an earlier test drew once for all frames
-    monkeypatch.setattr("webbrowser.open", lambda url: None)
-    (tmp_path / "heater.py").write_text(FILE)
-    (tmp_path / "data.csv").write_text(run_table_csv(runs(rng=np.random.default_rng(2))))
-    monkeypatch.chdir(tmp_path)
     verb, *words = command.split()
     assert main([verb, *words, "--out", "out", "--quiet"]) == 1
     *_, said = capsys.readouterr().err.splitlines()
     assert said.startswith(f"probewise {verb}: could not draw ")
     assert "(KeyError: 0.0)" in said
-    out = tmp_path / "out"
+    out = folder / "out"
     assert {
         path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file() and path.name[0] != "."
     } == set(COMMANDS[command])
@@ -96,7 +94,6 @@ def test_a_command_that_cannot_draw_writes_the_rest_says_so_in_a_line_and_exits_
 JOURNALS = ("journal.jsonl", "trials.jsonl", "concealed.jsonl", "cases.jsonl", "rounds")  # continued, or refused
 
 
-@pytest.mark.usefixtures("short_study")
 @pytest.mark.parametrize(
     "command",
     [
@@ -104,21 +101,15 @@ JOURNALS = ("journal.jsonl", "trials.jsonl", "concealed.jsonl", "cases.jsonl", "
         for words in (*COMMANDS, "diagnose data.csv --simulator heater.py --each", "explore --max-readings 1")
     ],
 )
-def test_a_persons_file_of_any_name_that_a_verb_writes_survives(
-    command, recording_file, sensor_file, tmp_path, monkeypatch, capsys
-):
+def test_a_persons_file_of_any_name_that_a_verb_writes_survives(command, folder, capsys):
     """Also what a person made of a result; what nobody has touched is replaced."""
-    monkeypatch.setattr("webbrowser.open", lambda url: None)
-    (tmp_path / "heater.py").write_text(FILE)
-    (tmp_path / "data.csv").write_text(run_table_csv(runs(rng=np.random.default_rng(2))))
-    monkeypatch.chdir(tmp_path)
     verb, *words = command.split()
 
     def names_in(out):
         names = [path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()]
         return sorted(name for name in names if "/." not in f"/{name}" and not name.startswith(JOURNALS))
 
-    plain, out = tmp_path / "plain", tmp_path / "out"
+    plain, out = folder / "plain", folder / "out"
     assert main([verb, *words, "--out", "plain", "--quiet"]) == 0
     written = names_in(plain)
     for name in written:

@@ -21,6 +21,13 @@ LINE = (
 )
 
 
+@pytest.fixture
+def words(tmp_path):
+    """What `diagnose` is given beside its recordings: a straight line, and a folder for each."""
+    (tmp_path / "line.py").write_text(LINE)
+    return "--simulator", str(tmp_path / "line.py"), "--each", "--out", str(tmp_path / "out"), "--quiet"
+
+
 def write_line(path, *, jump=0.0):
     x = np.linspace(0.0, 1.0, 40)
     y = 2 * x + 1 + 0.1 * np.random.default_rng(1).standard_normal(40) + jump * (x > 0.55)
@@ -28,12 +35,11 @@ def write_line(path, *, jump=0.0):
     return str(path)
 
 
-def test_each_recording_has_a_row_and_a_folder_and_is_diagnosed_once(tmp_path, monkeypatch):
-    law, out = tmp_path / "line.py", tmp_path / "out"
-    law.write_text(LINE)
+def test_each_recording_has_a_row_and_a_folder_and_is_diagnosed_once(words, tmp_path, monkeypatch):
+    out = tmp_path / "out"
     (tmp_path / "1.10.csv").write_text("x,z\n1,2\n")
     files = [write_line(tmp_path / "a.csv"), write_line(tmp_path / "b.csv", jump=0.8), str(tmp_path / "1.10.csv")]
-    given = ["diagnose", *files, "--simulator", str(law), "--each", "--out", str(out), "--quiet"]
+    given = ["diagnose", *files, *words]
     assert main(given) == 0
     with (out / "table.csv").open() as file:
         rows = {row["device"]: row for row in csv.DictReader(file)}
@@ -53,12 +59,10 @@ def test_each_recording_has_a_row_and_a_folder_and_is_diagnosed_once(tmp_path, m
         assert "a,refused,,,,,again" in (out / "table.csv").read_text().splitlines()
 
 
-def test_a_folder_that_cannot_be_written_to_is_told_with_what_is_kept(tmp_path, monkeypatch, capsys):
+def test_a_folder_that_cannot_be_written_to_is_told_with_what_is_kept(words, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("probewise.cli.diagnose._diagnosed", lambda words: ("", {"diagnosis.json": b"{}"}))
-    (tmp_path / "line.py").write_text(LINE)
     files = [write_line(tmp_path / "a.csv"), write_line(tmp_path / "b.csv")]
     (tmp_path / "out" / "b" / "diagnosis.json").mkdir(parents=True)
-    words = ["--simulator", str(tmp_path / "line.py"), "--each", "--out", str(tmp_path / "out")]
     assert main(["diagnose", *files, *words]) == 2
     assert "in the way; allowed: another folder, or none there; " in (said := capsys.readouterr().err)
     assert "go on with: probewise diagnose" in said
@@ -75,19 +79,16 @@ def test_rows_are_sorted_by_what_ails_most_devices():
     assert each.columns_of(rows)["probability"] == ["", "", "0.9", ""]
 
 
-def test_names_that_cannot_name_a_folder_and_one_with_other_results_are_refused(tmp_path, capsys):
-    law, out = tmp_path / "line.py", tmp_path / "out"
-    law.write_text(LINE)
-    given = ["--simulator", str(law), "--each", "--out", str(out)]
-    out.mkdir()
-    (out / "b").mkdir()
+def test_names_that_cannot_name_a_folder_and_one_with_other_results_are_refused(words, tmp_path, capsys):
+    out = tmp_path / "out"
+    (out / "b").mkdir(parents=True)
     (out / "b" / "fit.json").touch()
     for name, said in (("...csv", "another name"), ("..csv", "another name"), ("b.csv", "holds a fit")):
-        assert main(["diagnose", write_line(tmp_path / name), *given]) == 2
+        assert main(["diagnose", write_line(tmp_path / name), *words]) == 2
         assert said in capsys.readouterr().err
     (tmp_path / "elsewhere").mkdir()
     (out / "c").symlink_to(tmp_path / "elsewhere")
-    assert main(["diagnose", write_line(tmp_path / "c.csv"), *given]) == 2
+    assert main(["diagnose", write_line(tmp_path / "c.csv"), *words]) == 2
     assert "c: is a symbolic link, which may lead out of the folder" in capsys.readouterr().err
     assert not any((tmp_path / "elsewhere").iterdir())
     here = {path.name for path in tmp_path.iterdir()}
@@ -114,19 +115,10 @@ def test_the_processes_of_a_killed_command_end_with_it_and_leave_no_file(number,
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no pipes with names")
-def test_a_recording_that_is_a_pipe_is_waited_for_with_a_word(tmp_path, capsys):
-    (tmp_path / "line.py").write_text(LINE)
+def test_a_recording_that_is_a_pipe_is_waited_for_with_a_word(words, tmp_path, capsys):
     os.mkfifo(tmp_path / "a.csv")
     threading.Thread(target=lambda: (tmp_path / "a.csv").write_text("no table"), daemon=True).start()
-    given = [
-        str(tmp_path / "a.csv"),
-        "--simulator",
-        str(tmp_path / "line.py"),
-        "--each",
-        "--out",
-        str(tmp_path / "out"),
-    ]
-    assert main(["diagnose", *given, "--quiet"]) == 0
+    assert main(["diagnose", str(tmp_path / "a.csv"), *words]) == 0
     assert "a.csv is a pipe: reading it waits" in capsys.readouterr().err
 
 

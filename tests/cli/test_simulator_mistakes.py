@@ -68,12 +68,6 @@ FILES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(("change", "said"), FILES.values(), ids=FILES)
-def test_a_mistake_in_the_file_is_one_line(capsys, tmp_path, change, said):
-    assert change[0] in FILE
-    assert said in refused(capsys, tmp_path, FILE.replace(*change))
-
-
 def test_an_exit_at_some_parameters_makes_them_impossible(tmp_path):
     path = tmp_path / "heater.py"
     path.write_text(FILE.replace("return p", "if np.any(p['gain'] < 5): raise SystemExit\n    return p"))
@@ -122,11 +116,6 @@ TABLES = {
 }
 
 
-@pytest.mark.parametrize(("table", "said"), TABLES.values(), ids=TABLES)
-def test_a_mistake_in_the_table_is_one_line(capsys, tmp_path, table, said):
-    assert said in refused(capsys, tmp_path, FILE, table=table)
-
-
 HEADER = FILE.partition("def simulate")[0]
 LAWS = {
     "a state that starts nowhere": (
@@ -172,28 +161,31 @@ LAWS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(("law", "said"), LAWS.values(), ids=LAWS)
-def test_a_mistake_in_a_law_is_one_line(capsys, tmp_path, law, said):
-    """Also where a column of the table is text, such as a note."""
-    header, *rows = run_table_csv(runs()).splitlines()
-    table = "\n".join([f"note,{header}", *(f"a,{row}" for row in rows)]) + "\n"
-    assert said in refused(capsys, tmp_path, law, table=table)
+FURTHER = {
+    "text in a further table": (cell(5, "temp_c", "warm"), "reading 'temp_c' in row 5 is warm; allowed: a number"),
+    "a further table's time": (cell(5, "t_s", "1"), "column 't_s' in row 5 is 1.0; allowed: 10 or more"),
+    "no reading in a further table": (
+        run_table_csv(runs()).replace("temp_c", "temp"),
+        "no column 'temp_c'; allowed: the reading, as in data.csv; the header has 'run', 't_s'",
+    ),
+}  # fmt: skip
+WITH_A_NOTE = "\n".join(("note," if k == 0 else "a,") + row for k, row in enumerate(run_table_csv(runs()).splitlines()))
+# By name the file, its table, a further table, and what is said; laws meet a column of text, such as a note.
+MISTAKES = {
+    **{name: (FILE.replace(*change), None, None, said) for name, (change, said) in FILES.items()},
+    **{name: (FILE, table, None, said) for name, (table, said) in TABLES.items()},
+    **{f"law: {name}": (law, f"{WITH_A_NOTE}\n", None, said) for name, (law, said) in LAWS.items()},
+    **{name: (FILE, None, text, f"more.csv: {said}") for name, (text, said) in FURTHER.items()},
+}
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        (cell(5, "temp_c", "warm"), "more.csv: reading 'temp_c' in row 5 is warm; allowed: a number in each row"),
-        (cell(5, "t_s", "1"), "more.csv: column 't_s' in row 5 is 1.0; allowed: 10 or more"),
-        (
-            run_table_csv(runs()).replace("temp_c", "temp"),
-            "more.csv: no column 'temp_c'; allowed: the reading, as in data.csv; the header has 'run', 't_s'",
-        ),
-    ],
-)
-def test_a_mistake_in_a_further_table_is_told_with_its_file_and_row(capsys, tmp_path, text, said):
-    (tmp_path / "more.csv").write_text(text)
-    assert said in refused(capsys, tmp_path, FILE, more=(str(tmp_path / "more.csv"),))
+@pytest.mark.parametrize(("file", "table", "further", "said"), MISTAKES.values(), ids=MISTAKES)
+def test_a_mistake_is_one_line(capsys, tmp_path, file, table, further, said):
+    assert file != FILE or table or further
+    if further is not None:
+        (tmp_path / "more.csv").write_text(further)
+    more = () if further is None else (str(tmp_path / "more.csv"),)
+    assert said in refused(capsys, tmp_path, file, table=table, more=more)
 
 
 def test_a_row_in_which_an_input_is_missing_is_left_out_and_noted():

@@ -168,20 +168,6 @@ BAD_TABLES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("what", BAD_TABLES)
-def test_a_bad_table_is_answered_with_file_row_and_column(tmp_path, what):
-    csv, fragments = BAD_TABLES[what]
-    path = put(tmp_path, csv)
-    with pytest.raises(FileError) as caught:
-        read_recording(path)
-    message = str(caught.value)
-    assert message.startswith(str(path))
-    assert "allowed: " in message
-    assert "\n" not in message
-    for fragment in fragments:
-        assert fragment in message
-
-
 def test_a_pattern_must_be_named_where_there_are_several(tmp_path):
     with pytest.raises(FileError, match=r"row 1, column pattern: .*2 patterns"):
         read_recording(put(tmp_path, HEAD + "0,0,1\n", TWO))
@@ -229,17 +215,18 @@ BAD_DESCRIPTIONS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("what", BAD_DESCRIPTIONS)
-def test_a_bad_description_is_answered_with_file_and_field(tmp_path, what):
-    text, fragments = BAD_DESCRIPTIONS[what]
-    path = put(tmp_path, HEAD + "0,0,1\n")
-    (tmp_path / "rec.json").write_text(text)
+@pytest.mark.parametrize("what", [*BAD_TABLES, *BAD_DESCRIPTIONS])
+def test_a_bad_file_is_answered_with_its_name_its_row_and_column_or_its_field(tmp_path, what):
+    content, fragments = (BAD_TABLES | BAD_DESCRIPTIONS)[what]
+    path = put(tmp_path, content if what in BAD_TABLES else HEAD + "0,0,1\n")
+    if what in BAD_DESCRIPTIONS:
+        (tmp_path / "rec.json").write_text(content)
     with pytest.raises(FileError) as caught:
         read_recording(path)
     message = str(caught.value)
-    assert message.startswith(str(tmp_path))
-    assert "allowed: " in message
-    for fragment in fragments:
+    assert message.startswith(str(path if what in BAD_TABLES else tmp_path))
+    assert "\n" not in message
+    for fragment in ("allowed: ", *fragments):
         assert fragment in message
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from probewise import __version__
 from probewise.cli import main
 from probewise.effects import VOCABULARY
 from probewise.errors import FileError
@@ -29,10 +30,8 @@ from ..conftest import case, hidden, outside, single
 def file_of(tmp_path):
     """Write a campaign's file of cases made by hand."""
 
-    def write(results, seed=3, version=None):
-        from probewise import __version__
-
-        settings = {"challenge": version or __version__, "seed": seed}
+    def write(results, seed=3, version=__version__):
+        settings = {"challenge": version, "seed": seed}
         lines = [{"format": "campaign/1", "settings": settings}]
         lines += [{"key": Task(seed, k).key, "result": r} for k, r in enumerate(results)]
         path = tmp_path / "cases.jsonl"
@@ -93,14 +92,8 @@ def test_the_page_stands_alone_and_tells_of_failures(results):
     assert "http://" not in page
 
 
-def test_the_verb_scores_what_its_file_holds(results, tmp_path, capsys):
-    from probewise import __version__
-
-    out = tmp_path / "out"
-    out.mkdir()
-    lines = [{"format": "campaign/1", "settings": {"challenge": __version__, "seed": 5}}]
-    lines += [{"key": Task(5, k).key, "result": r} for k, r in enumerate(results)]
-    (out / "cases.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+def test_the_verb_scores_what_its_file_holds(results, file_of, capsys):
+    out = file_of(results, seed=5).parent
     assert main(["challenge", "--cases", "6", "--seed", "5", "--out", str(out)]) == 0
     assert "6 cases" in capsys.readouterr().out
     assert (out / "table.csv").read_text().startswith("what,found")

@@ -279,9 +279,8 @@ def test_a_full_disk_names_the_picture_and_the_journal(sensor_file, tmp_path, qu
     assert len([json.loads(line) for line in (out / "journal.jsonl").read_text().splitlines()]) == 2
 
 
-def command_of_killed(sensor_file, out, *more):
-    where = ("--sensor", sensor_file, "--truth", "500,250,90", "--out", out, "--seed", 3, "--quiet")
-    return [str(word) for word in ("explore", *where, "--max-readings", 4, *more)]
+def four_readings(sensor_file, out, *more):
+    return command(sensor_file, out, "--max-readings", 4, *more)
 
 
 @pytest.mark.slow
@@ -291,7 +290,7 @@ def test_a_resumed_run_is_byte_for_byte_the_one_that_was_never_interrupted(
 ):
     """Stopped before each reading, and between a reading and what was inferred from it; all in one sitting."""
     more = ("--batch", batch)
-    assert main(command_of_killed(sensor_file, tmp_path / "whole", *more)) == 0
+    assert main(four_readings(sensor_file, tmp_path / "whole", *more)) == 0
     whole = (tmp_path / "whole" / "journal.jsonl").read_bytes()
     lines = whole.splitlines(keepends=True)
     n_kept = [1, 2, 4] if batch == 1 else [2]
@@ -300,7 +299,7 @@ def test_a_resumed_run_is_byte_for_byte_the_one_that_was_never_interrupted(
         out = tmp_path / f"cut at {cut}"
         out.mkdir()
         (out / "journal.jsonl").write_bytes(whole[:cut])
-        assert main(command_of_killed(sensor_file, out, *more, "--resume")) == 0
+        assert main(four_readings(sensor_file, out, *more, "--resume")) == 0
         assert (out / "journal.jsonl").read_bytes() == whole, cut
         assert content_of(out) == content_of(tmp_path / "whole") or cut == cuts[-1]  # which notes the torn line
 
@@ -316,11 +315,11 @@ def test_a_second_run_on_the_same_journal_is_refused_and_the_first_goes_on(
     def begin_another(*_, **__):
         if not second:
             second.append(None)
-            second[:] = [main(command_of_killed(sensor_file, out, "--resume")), capsys.readouterr().err]
+            second[:] = [main(four_readings(sensor_file, out, "--resume")), capsys.readouterr().err]
         return drawn()
 
     monkeypatch.setattr(exploration, "robot_view_png", begin_another)
-    assert main(command_of_killed(sensor_file, out, "--max-readings", 1)) == 0
+    assert main(four_readings(sensor_file, out, "--max-readings", 1)) == 0
     status, said = second
     assert status == 2
     assert said.count("\n") == 1
@@ -334,7 +333,7 @@ def test_kill_9_at_random_moments_changes_nothing_of_the_outcome(sensor_file, tm
     """As processes, with all pictures; killed twice in all, and no run more often than that."""
     began_s = time.monotonic()
     run = [sys.executable, "-m", "probewise"]
-    subprocess.run([*run, *command_of_killed(sensor_file, tmp_path / "whole")], check=True)
+    subprocess.run([*run, *four_readings(sensor_file, tmp_path / "whole")], check=True)
     whole_s, whole = time.monotonic() - began_s, content_of(tmp_path / "whole")
     chance = random.Random(int(os.environ.get("PROBEWISE_KILL_SEED", "1")))
     n_killed = 0
@@ -343,7 +342,7 @@ def test_kill_9_at_random_moments_changes_nothing_of_the_outcome(sensor_file, tm
         status = None
         while status != 0:
             more = ["--resume"] if (out / "journal.jsonl").exists() else []
-            process = subprocess.Popen([*run, *command_of_killed(sensor_file, out, *more)])
+            process = subprocess.Popen([*run, *four_readings(sensor_file, out, *more)])
             killer = threading.Timer(chance.uniform(0.1, 0.9) * whole_s, process.kill)
             if n_killed < 2:
                 killer.start()

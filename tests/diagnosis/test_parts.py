@@ -47,6 +47,12 @@ def line(n: int = 12, *, scans: int = 2, unit: str = "LEGO") -> Recording:
     return Recording(plan, np.linspace(1.0, 2.0, n * scans), source=f"{unit}.csv")
 
 
+def declared(recording: Recording, name: str, covariates=None, **instrumentation) -> Recording:
+    """The recording as that of a file, with what its description declares."""
+    plan = replace(recording.plan, instrumentation=replace(recording.plan.instrumentation, **instrumentation))
+    return Recording(replace(plan, covariates=covariates or {}), recording.readings, name)
+
+
 def placed(effect, change, without, plan, covariates):
     shows_in = LightSensorApparatus().covariate_of_effect(effect, change, without, plan, covariates)
     scans = next((c for c in covariates if c.name == "scan"), None)
@@ -314,11 +320,8 @@ def test_a_recording_is_not_counted_twice():
 def test_a_covariate_that_a_later_recording_lacks_stays_as_it_was_last_known():
     first, second = line(4), line(3)
     battery = np.append(np.linspace(8300.0, 8290.0, len(first) - 1), np.nan)
-    measured = Recording(replace(first.plan, covariates={"battery_mv": battery}), first.readings, "one.csv")
-    warm = Recording(
-        replace(second.plan, covariates={"heat_c": np.full(len(second), 21.0)}), second.readings, "two.csv"
-    )
-    joined = join([measured, warm])
+    warm = declared(second, "two.csv", {"heat_c": np.full(len(second), 21.0)})
+    joined = join([declared(first, "one.csv", {"battery_mv": battery}), warm])
     assert (joined.plan.covariates["battery_mv"][len(first) :] == 8290.0).all()
     assert np.isnan(joined.plan.covariates["battery_mv"][len(first) - 1])
     assert set(joined.plan.covariates) == {"battery_mv"}
@@ -329,15 +332,7 @@ def test_a_covariate_that_a_later_recording_lacks_stays_as_it_was_last_known():
 
 
 def test_a_range_or_height_that_a_later_recording_declares_in_another_way_is_told():
-    first, second = line(4), line(3)
-    low, high = (
-        Recording(
-            replace(own.plan, instrumentation=replace(own.plan.instrumentation, max=most, height_mm=height)),
-            own.readings,
-            name,
-        )
-        for own, most, height, name in ((first, 5.0, None, "one.csv"), (second, None, 20.0, "two.csv"))
-    )
+    low, high = declared(line(4), "one.csv", max=5.0), declared(line(3), "two.csv", max=None, height_mm=20.0)
     assert join([low, high]).notes == (
         "two.csv declares no value for max: taken is 5, that of one.csv",
         "two.csv declares 20 for height_mm: taken is none, as one.csv",
@@ -349,18 +344,8 @@ def test_recordings_of_other_heights_are_joined_each_at_its_own():
     """The second as a plan of the first's height that commands 20 mm, except where it commands a height itself."""
     first, second = line(4), line(3)
     lifted = np.where(np.arange(len(second)) < 4, 25.0, np.nan)
-    low, high = (
-        Recording(
-            replace(
-                own.plan,
-                instrumentation=replace(own.plan.instrumentation, height_mm=height),
-                covariates={} if column is None else {"height_mm": column},
-            ),
-            own.readings,
-            name,
-        )
-        for own, height, column, name in ((first, 14.0, None, "one.csv"), (second, 20.0, lifted, "two.csv"))
-    )
+    low = declared(first, "one.csv", height_mm=14.0)
+    high = declared(second, "two.csv", {"height_mm": lifted}, height_mm=20.0)
     joined = join([low, high])
     assert joined.plan.instrumentation.height_mm == 14.0
     np.testing.assert_array_equal(

@@ -173,15 +173,18 @@ def test_the_result_holds_hypotheses_a_credible_set_and_a_sentence(doubting, ste
     assert "tilt" in document["sentence"]
 
 
+def weighed(info, change):
+    """The step with `change(index, left_out)`, fields of the weighted samples, made to each kind's."""
+    particles = tuple(
+        replace(p, weighted=replace(p.weighted, **change(k, kind.left_out)))
+        for k, (kind, p) in enumerate(zip(info.by_kind.kinds, info.by_kind.particles, strict=True))
+    )
+    return replace(info, by_kind=replace(info.by_kind, particles=particles))
+
+
 def leading(info, name):
     """The step as if one rival led."""
-    weighted = [
-        replace(p.weighted, log_z=0.0 if kind.left_out == name else -40.0)
-        for kind, p in zip(info.by_kind.kinds, info.by_kind.particles, strict=True)
-    ]
-    particles = tuple(replace(p, weighted=w) for p, w in zip(info.by_kind.particles, weighted, strict=True))
-    by_kind = replace(info.by_kind, particles=particles)
-    return replace(info, by_kind=by_kind)
+    return weighed(info, lambda _, left_out: {"log_z": 0.0 if left_out == name else -40.0})
 
 
 def test_what_leads_is_said_with_its_numbers(stepped):
@@ -208,11 +211,7 @@ def test_a_name_that_the_warier_odds_leave_open_is_in_the_credible_set(stepped):
     """Two routes: the odds of a name by hand, fourteen times those of a run that expects a fault one time in ten."""
     last = leading(stepped[-1], "")
     for name, log_z in (("dropouts", 0.0), ("halo", -2.5)):
-        particles = tuple(
-            replace(p, weighted=replace(p.weighted, log_z=log_z)) if kind.left_out == name else p
-            for kind, p in zip(last.by_kind.kinds, last.by_kind.particles, strict=True)
-        )
-        last = replace(last, by_kind=replace(last.by_kind, particles=particles))
+        last = weighed(last, lambda _, own, name=name, log_z=log_z: {"log_z": log_z} if own == name else {})
     share = 0.1 / (len({kind.left_out for kind in last.by_kind.kinds}) - 1)
     plain, wary = share / (0.9 + share), 14.0 * share / (0.9 + 14.0 * share)
     said = left_out_after_step(last, 0.9)
@@ -475,12 +474,7 @@ def test_play_of_each_axis_is_so_after_the_file_of_the_repaired_sensor_too(doubt
     """By hand: after a diagonal move each axis rests half the play short, not its share of the motion's direction."""
     of_axes = [kind.left_out for kind in doubting.kinds].index("backlash") + 1
     info = leading(stepped[-1], "backlash")
-    kept = np.array([kind.left_out != "backlash" or k == of_axes for k, kind in enumerate(doubting.kinds)])
-    particles = tuple(
-        replace(p, weighted=replace(p.weighted, log_z=p.weighted.log_z if keep else -40.0))
-        for p, keep in zip(info.by_kind.particles, kept, strict=True)
-    )
-    info = replace(info, by_kind=replace(info.by_kind, particles=particles))
+    info = weighed(info, lambda k, own: {"log_z": -40.0} if own == "backlash" and k != of_axes else {})
     write_sensor(repaired_sensor(sensor, info, rng=np.random.default_rng(1)), tmp_path / "sensor.json")
     read = read_sensor(tmp_path / "sensor.json")
     plan = Plan.from_arrays(x_mm=[0.0, 3.0], y_mm=[0.0, 4.0], patterns=Uniform(0.5), unit="LEGO")
@@ -506,11 +500,7 @@ def test_what_changed_since_the_calibration_is_in_the_levels_of_the_repaired_sen
         theta[:, 3:] = changes[name]
         changed = doubting.kinds[which].model.predict(np.array([[*circle, *changes[name]]]), plan)
         np.testing.assert_allclose(changed - plain, [[dark, bright]], atol=0.31)  # of a sensor with a span of 50
-        particles = [
-            replace(p, weighted=replace(found, theta=theta)) if k == which else p
-            for k, p in enumerate(info.by_kind.particles)
-        ]
-        info = replace(info, by_kind=replace(info.by_kind, particles=tuple(particles)))
+        info = weighed(info, lambda k, _, theta=theta, which=which: {"theta": theta} if k == which else {})
         before, after = sensor.mean(), repaired_sensor(sensor, info, rng=np.random.default_rng(1)).mean()
         assert after["I_min"] - before["I_min"] == pytest.approx(dark)
         assert after["I_max"] - before["I_max"] == pytest.approx(bright, rel=0.02)

@@ -61,13 +61,12 @@ class Terminal:
 class Marlin:
     """The printer; faults come at the n-th line that it receives (from 1).
 
-    `garble`: lines that arrive with a wrong checksum; `lose`: whose number is missed; `halt`: at which it kills itself;
-    `deaf`: from which on it says nothing; `bumps_mm`: x beyond which a switch is hit, where endstops are heeded.
+    `garble`: lines that arrive with a wrong checksum; `halt`: at which it kills itself; `deaf`: from which on it says
+    nothing; `bumps_mm`: x beyond which a switch is hit, where endstops are heeded.
     """
 
     light: object
     garble: tuple = ()
-    lose: tuple = ()
     halt: int = 0
     deaf: int = 0
     bumps_mm: float = math.inf
@@ -110,7 +109,7 @@ class Marlin:
             right = functools.reduce(operator.xor, text.rpartition("*")[0].encode())
             if checksum != right or n in self.garble:
                 return self._refuse("checksum mismatch")
-            if (number != self._last + 1 and not command.startswith("M110")) or n in self.lose:
+            if number != self._last + 1 and not command.startswith("M110"):
                 return self._refuse("Line Number is not Last Line Number+1")
             self._last = number
         self._obey(command)

@@ -1,5 +1,6 @@
-"""Each verb writes what it promises, and nothing when it is stopped."""
+"""Each verb writes what it promises, also with a simulator of a person's own, and nothing when it is stopped."""
 
+import csv
 import json
 import os
 import subprocess
@@ -10,6 +11,7 @@ import jsonschema
 import numpy as np
 import pytest
 from command import run
+from heater import FILE, runs
 
 from probewise import __version__
 from probewise.calibration import predict, read_sensor
@@ -17,8 +19,17 @@ from probewise.cli import VERBS, main
 from probewise.diagnosis import diagnosis_schema
 from probewise.effects import VOCABULARY
 from probewise.errors import NotConvergedError
-from probewise.recordings import read_plan, read_plan_and_readings, read_prediction_columns
+from probewise.recordings import (
+    paper_plan,
+    parse_strict_json,
+    read_plan,
+    read_plan_and_readings,
+    read_prediction_columns,
+    read_recording,
+    write_plan,
+)
 from probewise.report import exploration
+from probewise.systems import run_table_csv
 
 
 def test_predictions_come_back_from_the_file_as_they_were_computed(sensor_file, recording_file, tmp_path, capsys):
@@ -206,3 +217,158 @@ def test_without_a_directory_nothing_is_written(recording_file, tmp_path, capsys
     assert run("audit", recording_file) == 0
     assert "backlash" in capsys.readouterr().out
     assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    out = tmp_path_factory.mktemp("heater")
+    (out / "heater.py").write_text(FILE)
+    (out / "data.csv").write_text(run_table_csv(runs(rng=np.random.default_rng(2))))
+    (out / "new.csv").write_text(run_table_csv(runs((20.0, 23.0), names="45", rng=np.random.default_rng(3))))
+    return out
+
+
+def with_heater(folder, verb, *arguments):
+    names = [folder / a if (folder / a).exists() else a for a in arguments]
+    assert run(verb, *names, "--simulator", folder / "heater.py", "--quiet") == 0
+
+
+@pytest.fixture(scope="module")
+def fit(folder):
+    with_heater(folder, "fit", "data.csv", "--out", folder / "fit")
+    return folder / "fit"
+
+
+@pytest.mark.slow
+def test_a_fit_finds_what_the_readings_were_made_with(fit):
+    document = parse_strict_json((fit / "fit.json").read_text())
+    found = {p["name"]: p["interval95"] for p in document["parameters"]}
+    assert found["tau_s"][0] < 15.0 < found["tau_s"][1]
+    assert found["gain"][0] < 3.0 < found["gain"][1]
+    assert (fit / "report.html").stat().st_size > 10_000
+    with (fit / "samples.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) >= 500
+    assert list(rows[0]) == ["tau_s", "gain", "start_c[1]", "start_c[2]", "start_c[3]", "noise_sd"]
+
+
+def test_a_fit_predicts_runs_that_it_has_not_seen(folder, fit):
+    with_heater(folder, "predict", fit / "fitted.json", "new.csv", "--out", folder / "p.csv")
+    with (folder / "p.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    z = [(float(r["temp_c"]) - float(r["mean"])) / float(r["sd"]) for r in rows]
+    assert len(rows) == 24
+    assert max(map(abs, z)) < 3
+    assert all(np.isfinite(float(r["log_density"])) for r in rows)
+
+
+@pytest.mark.slow
+def test_an_audit_needs_no_readings(folder):
+    lines = (folder / "data.csv").read_text().splitlines()
+    (folder / "plan.csv").write_text("\n".join(line.rpartition(",")[0] for line in lines) + "\n")
+    with_heater(folder, "audit", "plan.csv", "--out", folder / "audit")
+    document = parse_strict_json((folder / "audit" / "audit.json").read_text())
+    found = {effect["name"]: effect for effect in document["effects"]}
+    assert found["sensitivity:room_c"]["sight"] == "invisible"
+    assert found["offset_step"]["rows"] > 64
+    assert any({"offset_step", "steps:start_c"} <= set(names) for names in document["alias_classes"])
+
+
+@pytest.mark.slow
+def test_a_diagnosis_writes_what_the_contract_promises(folder):
+    out = folder / "diagnosis"
+    with_heater(folder, "diagnose", "data.csv", "new.csv", "--out", out)
+    document = parse_strict_json((out / "diagnosis.json").read_text())
+    jsonschema.validate(document, diagnosis_schema())
+    assert document["verdict"] == "clean"
+    for name in ("repaired.json", "calibrated.json"):
+        text = (out / name).read_text()
+        assert json.loads(text)["format"] == "system/1"
+        with_heater(folder, "predict", out / name, "new.csv", "--out", folder / f"{name}.csv")
+    page = (out / "report.html").read_text().lower()
+    for word in (" scan ", "lamp", " arm ", "black and white", "sensor.json", "next_plan"):
+        assert word not in page
+    if document["next_measurement"] is not None:
+        assert document["next_measurement"]["plan"] == "next.csv"
+        asked = (out / "next.csv").read_text().splitlines()[1:]
+        assert len(asked) == document["next_measurement"]["readings"]
+        with_heater(folder, "predict", out / "repaired.json", out / "next.csv", "--out", folder / "n.csv")
+
+
+@pytest.fixture
+def few(tmp_path):
+    """Two scans across the edge: a diagnosis of them is quick."""
+    plan = paper_plan()
+    path = tmp_path / "few.csv"
+    write_plan(plan.take(plan.scan < 2), path)
+    return path
+
+
+@pytest.mark.slow
+def test_one_round_leaves_a_diagnosis_and_all_it_was_made_of(few, tmp_path, capsys):
+    out = tmp_path / "out"
+    options = ("--plan", few, "--truth", "nothing", "--rounds", 1, "--seed", 1)
+    assert run("investigate", *options, "--out", out) == 0
+    names = {path.name for path in out.iterdir()}
+    assert {
+        "diagnosis.json",
+        "sensor.json",
+        "calibrated.json",
+        "recording.csv",
+        "report.html",
+        "rounds",
+        "by_round.png",
+    } <= names
+    assert len(read_recording(out / "recording.csv")) == len(read_recording(out / "rounds" / "1.csv"))
+    assert json.loads((out / "diagnosis.json").read_text())["verdict"]
+    said = capsys.readouterr().out
+    assert "round 1:" in said
+    assert "concealed    nothing" in said
+    page = (out / "report.html").read_text()
+    assert "How it came to that" in page
+    assert "http://" not in page
+
+
+@pytest.mark.slow
+def test_an_aliased_effect_is_settled_by_the_readings_that_are_asked_for(tmp_path):
+    out = tmp_path / "out"
+    options = ("--plan", "paper", "--truth", "backlash:0.5", "--seed", 4, "--quiet")
+    assert run("investigate", *options, "--out", out) == 0
+    found = json.loads((out / "diagnosis.json").read_text())
+    assert found["hypotheses"][0]["effects"] == ["backlash"]
+    assert found["hypotheses"][0]["probability"] > 0.95
+    assert (out / "rounds" / "2.csv").exists()
+    assert set(read_recording(out / "recording.csv").plan.sessions) >= {0, 1}
+
+
+OWN = """
+import math
+
+def connect():
+    return Edge()
+
+class Edge:
+    turns = True
+
+    def measure(self, pose):
+        across = pose.x_mm * math.cos(0.0) / 6.0
+        return round(10.0 + 25.0 * (1.0 + math.tanh(across)) + 0.4 * math.sin(37.0 * pose.x_mm + 11.0 * pose.y_mm), 3)
+
+    def close(self):
+        with open(CLOSED, "w") as file:
+            file.write("closed")
+"""
+
+
+@pytest.mark.slow
+def test_an_instrument_of_ones_own_is_investigated_and_closed(few, tmp_path):
+    file, closed, out = tmp_path / "edge.py", tmp_path / "closed.txt", tmp_path / "out"
+    file.write_text(OWN.replace("CLOSED", repr(str(closed))))
+    one = tmp_path / "one.csv"
+    plan = paper_plan()
+    write_plan(plan.take(plan.scan < 1), one)
+    options = ("--arm", file, "--plan", one, "--rounds", 1, "--no-hands", "--quiet")
+    assert run("investigate", *options, "--out", out) == 0
+    assert closed.read_text() == "closed"
+    assert len(read_recording(out / "recording.csv")) == len(read_recording(out / "rounds" / "1.csv"))
+    assert "the world concealed" not in (out / "report.html").read_text()

@@ -181,17 +181,17 @@ def test_the_rows_back_to_the_previous_reading_are_those_of_the_run():
         assert before[k] == (same[-1] if same.size else -1)
 
 
-N_OF_OUTLYING = 60
-TIME = np.arange(float(N_OF_OUTLYING))
-LOST = np.arange(N_OF_OUTLYING) % 4 == 1
-LAW = NoiseLaw(np.ones(N_OF_OUTLYING), np.zeros(N_OF_OUTLYING), LOST)
+N_WITH_LOST = 60
+TIME = np.arange(float(N_WITH_LOST))
+LOST = np.arange(N_WITH_LOST) % 4 == 1
+LAW = NoiseLaw(np.ones(N_WITH_LOST), np.zeros(N_WITH_LOST), LOST)
 WITHOUT = white_noise(int((~LOST).sum()))
 
 
 def test_lost_readings_change_no_density_of_held_out_readings():
     """A line predicts more than a constant, and as much more where lost readings are missing in the table instead."""
     x = np.sin(0.7 * TIME)
-    y = 1.0 + 0.1 * x + 0.1 * np.random.default_rng(5).standard_normal(N_OF_OUTLYING)
+    y = 1.0 + 0.1 * x + 0.1 * np.random.default_rng(5).standard_normal(N_WITH_LOST)
     simulators = (
         Simulator("y", "V", {"a": (-5, 5)}, simulate=lambda p, u: p["a"] + 0 * u["x"]),
         Simulator("y", "V", {"a": (-5, 5), "b": (-5, 5)}, simulate=lambda p, u: p["a"] + p["b"] * u["x"]),

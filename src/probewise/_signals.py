@@ -148,12 +148,15 @@ def _stop(number: int, frame: FrameType | None) -> None:
 
 
 def _raise_again(ignored: sys.UnraisableHookArgs) -> None:
-    """Raise `Stopped` soon again where Python ignores exceptions, as in a callback of its garbage collection."""
+    """Raise `Stopped` soon again where Python ignores exceptions, as in a callback of its garbage collection.
+
+    Not at once: while the timer starts, the exception would be ignored again.
+    """
     if not isinstance(ignored.exc_value, Stopped):
         sys.__unraisablehook__(ignored)
         return
     _asked.clear()
-    threading.Timer(0.01, signal.raise_signal, (ignored.exc_value.number,)).start()
+    threading.Timer(0.25, signal.raise_signal, (ignored.exc_value.number,)).start()
 
 
 def _stopped_behind(error: BaseException) -> Stopped | None:

@@ -11,7 +11,7 @@ from exploring import run
 from probewise.arm import read_geometry, shipped_geometry_path
 from probewise.arm.instrument import Pose, Reading
 from probewise.effects import EFFECTS, Known, Origin
-from probewise.errors import DoubtfulResultWarning, FileError, LinkError, ParameterError
+from probewise.errors import FileError, LinkError, ParameterError
 from probewise.experiment import HiddenShape, JournalWriter, geometry_entry, read_journal, recording_of
 from probewise.experiment.journal import PosteriorSummary, require_same_settings, value_digest
 from probewise.recordings.patterns import Disc
@@ -30,8 +30,8 @@ def summary(k):
     return PosteriorSummary({"x_mm": 1.0 / 3.0 + k}, {"x_mm": 2.0 / k}, 1.25 * k, Pose(0.1 * k, 7.0))
 
 
-def write(path, n):
-    with JournalWriter.begin(path, SETTINGS) as writer:
+def write(path, n, settings=SETTINGS):
+    with JournalWriter.begin(path, settings) as writer:
         for k in range(1, n + 1):
             writer.write_reading(k, reading(k))
             writer.write_summary(summary(k))
@@ -51,7 +51,7 @@ def test_a_journal_is_one_json_object_a_line(tmp_path):
     write(tmp_path / "j", 2)
     lines = [json.loads(line) for line in (tmp_path / "j").read_text().splitlines()]
     assert len(lines) == 3
-    assert set(lines[1]) == {"index", "pose", "time_s", "reading", "covariates", "belief"}
+    assert set(lines[1]) == {"index", "pose", "time_s", "reading", "covariates", "belief", "digest"}
     assert set(lines[1]["belief"]) == {"mean", "sd", "bits", "next"}
 
 
@@ -160,8 +160,8 @@ def test_a_journal_without_a_usable_seed_is_refused(small, tmp_path, key):
             return 10.0
 
     run(Own(), experiment, rng=np.random.default_rng(5), max_readings=1, journal=tmp_path / "j")
-    first, *rest = (tmp_path / "j").read_text().split("\n")
-    (tmp_path / "j").write_text("\n".join([json.dumps({**json.loads(first), "spawn_key": key}), *rest]))
+    first = (tmp_path / "j").read_text().partition("\n")[0]
+    (tmp_path / "j").write_text(json.dumps({**json.loads(first), "spawn_key": key}) + "\n")
     with pytest.raises(FileError, match="spawn_key is"):
         run(Own(), experiment, rng=np.random.default_rng(5), max_readings=2, journal=tmp_path / "j")
 
@@ -244,23 +244,22 @@ def test_a_journal_that_names_the_geometry_is_not_resumed_with_another_and_an_ol
             require_same_settings(new, {**SETTINGS, **other})
 
 
-def test_a_line_that_was_changed_or_is_of_another_run_is_doubted(small, tmp_path):
-    def go_on(name, *lines, n=6):
-        if lines:
-            (tmp_path / name).write_text("\n".join([*lines, ""]))
-        rng = np.random.default_rng(5)
-        return run(small.arm(), small.experiment(), rng=rng, journal=tmp_path / name, max_readings=n)
-
-    go_on("j", n=5)
-    first, *lines = (tmp_path / "j").read_text().splitlines()
-    assert not go_on("whole", first, *lines).notes
-    third = json.loads(lines[2])
-    value = {**third, "reading": third["reading"] + 45.0}
-    place = {**third, "pose": {**third["pose"], "x_mm": third["pose"]["x_mm"] + 99.0}}
-    for name, changed, said in (("value", value, "bits and not"), ("place", place, "is 99 mm")):
-        with pytest.warns(DoubtfulResultWarning, match=f"line 4 of .*{name} was changed, or an earlier one: .*{said}"):
-            notes = go_on(name, first, *lines[:2], json.dumps(changed), *lines[3:]).notes
-        assert any("line 4" in note for note in notes)
+def test_a_line_that_was_changed_or_is_of_another_run_is_refused_and_older_lines_have_no_digest(tmp_path):
+    one, other = ((tmp_path / name) for name in ("j", "other"))
+    for path, settings in ((one, SETTINGS), (other, {**SETTINGS, "seed": "8"})):
+        write(path, 3, settings)
+    lines, others = (path.read_text().splitlines() for path in (one, other))
+    changed = lines[2].replace('"time_s": ', '"time_s": 1')
+    moved = lines[0].replace("{", "{ ", 1)
+    for row, wrong in ((3, [*lines[:2], changed, lines[3]]), (4, [*lines[:3], others[3]]), (2, [moved, *lines[1:]])):
+        one.write_text("\n".join([*wrong, ""]))
+        with pytest.raises(FileError, match=f"line {row}: this line or one before it was changed"):
+            read_journal(one)
+    one.write_text("\n".join([*(line.partition(', "digest"')[0] + "}" * (k > 0) for k, line in enumerate(lines)), ""]))
+    with JournalWriter.resume(read_journal(one)) as writer:
+        writer.write_reading(4, reading(4))
+        writer.write_summary(summary(4))
+    assert len(read_journal(one).entries) == 4
 
 
 def test_a_reading_that_the_sensor_cannot_return_is_not_written(small, tmp_path):
@@ -276,7 +275,8 @@ def test_a_reading_that_the_sensor_cannot_return_is_not_written(small, tmp_path)
     assert read_journal(tmp_path / "j").entries == ()
     value = 10.0
     run(Broken(), experiment, rng=np.random.default_rng(5), journal=tmp_path / "j", max_readings=1)
-    (tmp_path / "j").write_text((tmp_path / "j").read_text().replace('"reading": 10.0', '"reading": 1023.0'))
+    changed = (tmp_path / "j").read_text().replace('"reading": 10.0', '"reading": 1023.0')
+    (tmp_path / "j").write_text(changed.partition(', "digest"')[0] + "}\n")
     with pytest.raises(FileError, match=r"j, line 2: reading is 1023\.0; allowed: 0 to 100"):
         run(Broken(), experiment, rng=np.random.default_rng(5), journal=tmp_path / "j")
 

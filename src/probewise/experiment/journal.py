@@ -2,7 +2,7 @@
 
 Format "journal/1". The first line holds the settings: field, shape, model, likelihood, digest of the sensor, seed,
 options. Every further line is a measurement: index, pose, time, reading and covariates, then the posterior after it
-(mean and sd of each parameter, bits gained) and the next pose.
+(mean and sd of each parameter, bits gained), the next pose, and a digest of all that the file holds before it.
 
 A line reaches the disk in two parts. The reading is written and synchronised as soon as it is taken; the posterior
 summary (key "belief") follows after inference. So a process that is killed at any time loses no reading: a last line
@@ -39,6 +39,7 @@ from probewise.recordings.table import LARGEST_PLACE_MM
 
 FORMAT = "journal/1"
 _SUMMARY_KEY = ', "belief": '
+_DIGEST_KEY = ', "digest": '
 # Settings in which a resumed run may differ: files may have moved, and an arm may have another name.
 _FREE = frozenset({"format", "version", "spawn_key", "arm", "sensor_file"})
 # Settings that are compared only if the journal has them.
@@ -103,7 +104,8 @@ class Journal:
 def read_journal(path: str | Path) -> Journal:
     """Read a journal, even if its writer was killed at any time.
 
-    FileError if the file is missing, is not a journal of this version, or is damaged before its last line.
+    FileError if the file is missing, is not a journal of this version, is damaged before its last line, or a line has
+    another digest than that of the file up to there; lines of earlier versions, which have none, are taken as they are.
     """
     raw = read_bytes(checked_path("path", path), "a journal written by this package")
     *lines, tail = raw.split(b"\n")
@@ -113,11 +115,23 @@ def read_journal(path: str | Path) -> Journal:
     if settings.get("format") != FORMAT:
         found, allowed = f"format {shown(settings.get('format'))}", f'"{FORMAT}", the version this package writes'
         raise FileError(path, found, allowed, row=1)
-    entries = [_parse_entry(path, _parse_line(path, line, row), row) for row, line in enumerate(lines[1:], start=2)]
-    for row, entry in enumerate(entries, start=2):
+    entries: list[Entry] = []
+    digest = hashlib.sha256(lines[0])
+    for row, line in enumerate(lines[1:], start=2):
+        parsed = _parse_line(path, line, row)
+        entry = _parse_entry(path, parsed, row)
         if entry.index != row - 1:
             allowed = f"{row - 1}: one line per measurement, in order"
             raise FileError(path, f"index {shown(entry.index)}", allowed, row=row)
+        text, key, end = line.rpartition(_DIGEST_KEY.encode())
+        digest.update(b"\n" + text)
+        if parsed.get("digest", digest.hexdigest()) != digest.hexdigest():
+            allowed = (
+                "the journal as written; or one that ends before the first changed line, to go on there"
+            )
+            raise FileError(path, "this line or one before it was changed, or is of another run", allowed, row=row)
+        digest.update(key + end)
+        entries.append(entry)
     notes: list[str] = []
     n_torn = 0
     if tail:
@@ -253,6 +267,10 @@ class JournalWriter:
 
     path: Path
     _file: FileIO = field(repr=False)
+    _digest: hashlib._Hash = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        self._digest = hashlib.sha256(self.path.read_bytes())
 
     @classmethod
     @contextlib.contextmanager
@@ -303,7 +321,7 @@ class JournalWriter:
             "reading": _null_if_nan(reading.value),
             "covariates": {name: _null_if_nan(value) for name, value in reading.covariates.items()},
         }
-        write_and_sync(self._file, self.path, json.dumps(line, allow_nan=False)[:-1].encode())
+        self._append(json.dumps(line, allow_nan=False)[:-1])
 
     def write_summary(self, summary: PosteriorSummary) -> None:
         """Write the summary after the last reading written: the rest of its line."""
@@ -313,7 +331,13 @@ class JournalWriter:
             "bits": summary.bits,
             "next": _pose_as_json(summary.next_pose),
         }
-        write_and_sync(self._file, self.path, (_SUMMARY_KEY + json.dumps(line, allow_nan=False) + "}\n").encode())
+        text, digest = _SUMMARY_KEY + json.dumps(line, allow_nan=False), self._digest.copy()
+        digest.update(text.encode())
+        self._append(f'{text}{_DIGEST_KEY}"{digest.hexdigest()}"}}\n')
+
+    def _append(self, text: str) -> None:
+        write_and_sync(self._file, self.path, text.encode())
+        self._digest.update(text.encode())
 
 
 def _require_new_file(path: Path) -> None:

@@ -8,7 +8,6 @@ readings of another run.
 from __future__ import annotations
 
 import contextlib
-import math
 import warnings
 from collections.abc import Generator, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -32,7 +31,6 @@ from probewise.experiment.inquire import (
     predict_readings_and_utilities,
 )
 from probewise.experiment.journal import (
-    Entry,
     Journal,
     JournalWriter,
     PosteriorSummary,
@@ -59,8 +57,6 @@ from probewise.nested import Weighted
 from probewise.recordings.plan import Recording
 from probewise.sensor.commanded import height_ratio, led_state
 
-_OFF_MM = 30.0  # between the place of a reading and the one chosen for it
-_OFF_SDS, _OFF_BITS = 3.0, 2.0  # differences of posteriors; with other random numbers they are below 0.7
 _HEIGHT_TOLERANCE = 0.01  # share of the calibrated height, which changes the signal by 2 %
 
 
@@ -292,7 +288,7 @@ def _yield_steps(
     elif path is not None:
         opened = JournalWriter.begin(path, settings)
     with opened as writer:
-        stopped, changed = False, ""
+        stopped = False
         while not stopped:
             number = len(state.readings) + 1
             entry = replayed[number - 1] if number <= len(replayed) else None
@@ -316,14 +312,9 @@ def _yield_steps(
             if writer is not None and (entry is None or entry.summary is None):
                 writer.write_summary(_posterior_summary(info, state))
             if entry is not None and entry.summary is not None:
-                before_it = replayed[number - 2].summary if number > 1 else None
-                off = _contradiction(entry, before_it, _posterior_summary(info, state))
-                if off and not changed:
-                    changed = f"line {number + 1} of {path} was changed, or an earlier one: {off}"
-                    warn(changed, DoubtfulResultWarning)
                 # The journal's pose is used, even if another machine's arithmetic would choose another.
                 state = replace(state, next_pose=entry.summary.next_pose)
-            of_run = (*(notes if number == 1 else ()), *filter(None, (doubt, changed)))
+            of_run = (*(notes if number == 1 else ()), *(() if doubt is None else (doubt,)))
             stopped = info.stop_reason is not None
             yield replace(info, replayed=entry is not None, notes=(*info.notes, *of_run))
 
@@ -390,24 +381,6 @@ def _posterior_summary(info: Step, state: ExplorationState) -> PosteriorSummary:
     known |= info.sensor
     mean, sd = ({name: both[k] for name, both in known.items()} for k in (0, 1))
     return PosteriorSummary(mean, sd, info.bits, state.next_pose)
-
-
-def _contradiction(entry: Entry, before: PosteriorSummary | None, here: PosteriorSummary) -> str:
-    """Say what a journal's line contradicts by more than arms err and two machines' samples differ; "": nothing.
-
-    `before` is the posterior of the line before, which chose the pose; `here` is what this line's readings now give.
-    """
-    pose, there = entry.reading.pose, entry.summary
-    assert there is not None
-    chosen = pose if before is None else before.next_pose
-    off_mm = math.dist((pose.x_mm, pose.y_mm), (chosen.x_mm, chosen.y_mm))
-    if off_mm > _OFF_MM:
-        return f"its place is {off_mm:.0f} mm from the one that was chosen"
-    names = here.mean.keys() & there.mean.keys()
-    off = (abs(here.mean[name] - there.mean[name]) > _OFF_SDS * (here.sd[name] + there.sd[name]) for name in names)
-    if abs(here.bits - there.bits) <= _OFF_BITS and not any(off):
-        return ""
-    return f"its readings give {here.bits:.1f} bits and not {there.bits:.1f}, or another place"
 
 
 def run_from_place(

@@ -24,6 +24,7 @@ from probewise.recordings import (
     read_prediction_columns,
     read_recording,
 )
+from probewise.recordings.columns import notes_on_codes
 
 WHITE = {"white": {"kind": "uniform", "albedo": 1}}
 TWO = {**WHITE, "edge": {"kind": "half_plane", "normal_deg": 90, "offset_mm": 2}}
@@ -133,6 +134,16 @@ def test_every_pattern_kind_is_read(tmp_path):
 def test_an_orientation_beyond_a_full_turn_is_noted(tmp_path):
     path = put(tmp_path, "x_mm,y_mm,orientation_deg,reading\n0,0,90,1\n1,0,-9999,2\n")
     assert read_recording(path).notes == ("row 3: orientation_deg is -9999, beyond a full turn: mistyped?",)
+
+
+def test_numbers_that_stand_for_missing_ones_and_names_that_look_alike_are_noted(tmp_path):
+    rows = [f"{x},0,{x},{8300 + x},20,{'aA'[x > 2]}" for x in range(5)]
+    rows += ["999,0,6,-9999,20,A", "5,0,6,8301,-273.15,A"]
+    says = "column {} holds {}: if that says that a value is missing, empty the cell"
+    codes = [says.format(*each) for each in (("x_mm", 999), ("battery_mv", -9999), ("temp_c", -273.15))]
+    path = put(tmp_path, "\n".join(["x_mm,y_mm,reading,battery_mv,temp_c,scan", *rows, ""]))
+    assert read_recording(path).notes == (*codes, "column scan: 'A' and 'a' are different scans")
+    assert not notes_on_codes({"whole": np.arange(1000.0), "none": np.full(3, np.nan), "all": np.full(3, 999.0)})
 
 
 def test_time_that_runs_backwards_is_noted(tmp_path):

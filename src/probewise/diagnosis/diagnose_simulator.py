@@ -33,6 +33,7 @@ from probewise.effects.noise import SAYS_THE_SAME, says_what_readings_say
 from probewise.errors import ParameterError, ProbewiseError
 from probewise.priors import LogUniform, Normal, Uniform
 from probewise.progress import Progress, silent
+from probewise.recordings.columns import notes_on_codes
 from probewise.recordings.plan import Plan, Recording, masks_of_readings_at_ends
 from probewise.systems import RunRecording, RunTable, Simulator, System, as_recording, table_for
 from probewise.systems.calls import Caller, progress_with_call_count
@@ -562,7 +563,8 @@ def prepare_system(
     """
     table = _without_copies_of_reading(simulator, table) if with_effects else table
     order = (*_note_on_copied_rows(table), *note_on_row_order(simulator, table))
-    said = (*table.notes, *notes, *order, *_note_on_gaps_without_runs(simulator, table))
+    codes = notes_on_codes({n: values for n, values in table.covariates.items() if n != simulator.reading})
+    said = (*table.notes, *notes, *order, *codes, *_note_on_gaps_without_runs(simulator, table))
     recording = replace(recording_from_table(simulator, table), source=source or simulator.source, notes=said)
     system = System.of(simulator, table, stiff=stiff)
     if with_effects and len(table) < 2:  # nothing can change along it

@@ -126,9 +126,7 @@ def read_journal(path: str | Path) -> Journal:
         text, key, end = line.rpartition(_DIGEST_KEY.encode())
         digest.update(b"\n" + text)
         if parsed.get("digest", digest.hexdigest()) != digest.hexdigest():
-            allowed = (
-                "the journal as written; or one that ends before the first changed line, to go on there"
-            )
+            allowed = "the journal as written; or one that ends before the first changed line, to go on there"
             raise FileError(path, "this line or one before it was changed, or is of another run", allowed, row=row)
         digest.update(key + end)
         entries.append(entry)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import math
+import re
+import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Protocol
 
@@ -34,6 +36,9 @@ class TableLike(Protocol):
 
     def __getitem__(self, name: Any, /) -> Any:
         """Values of a column."""
+
+
+_CODE = re.compile(r"-99|-?9{3,}(\.9+)?|-273\.15|-?32768|32767|65535")  # of a missing value, in loggers
 
 
 def is_commanded(name: str, controls: Sequence[str]) -> bool:
@@ -263,11 +268,31 @@ def text_of_name(value: object) -> str:
     return number_text(value) if isinstance(value, float) else str(value)
 
 
-def notes_on_numbers_as_names(column: str, values: object, named: str) -> list[str]:
-    """Return a note if a column names runs, scans or patterns by numbers that are not whole; else none."""
-    if not any(isinstance(value, float) and value % 1 > 0 for value in np.ravel(np.asarray(values, dtype=object))):
-        return []
-    return [f"column {column} names {named} by numbers, of which 1.10 is 1.1; read it as text if they are two"]
+def notes_on_names(column: str, values: object, named: str) -> list[str]:
+    """Return notes if a column names runs, scans or patterns by numbers that are not whole, or names look alike."""
+    cells = set(np.ravel(np.asarray(values, dtype=object)).tolist())
+    as_numbers = any(isinstance(cell, float) and cell % 1 > 0 for cell in cells)
+    notes = [f"column {column} names {named} by numbers, of which 1.10 is 1.1; read it as text if they are two"]
+    alike: dict[str, set[str]] = {}
+    for text in (text_of_name(cell).strip() for cell in cells):
+        alike.setdefault(" ".join(unicodedata.normalize("NFKC", text).casefold().split()), set()).add(text)
+    several = sorted(" and ".join(map(ascii, sorted(texts))) for texts in alike.values() if len(texts) > 1)[:1]
+    return notes * as_numbers + [f"column {column}: {names} are different {named}" for names in several]
+
+
+def notes_on_codes(columns: Mapping[str, FloatArray]) -> list[str]:
+    """Note numbers such as loggers write where a value is missing, -9999 for one, that are far from all others."""
+    notes = []
+    for name, values in columns.items():
+        known = values[np.isfinite(values)]
+        ends = {known.min(), known.max()} if known.size else set()
+        codes = [end for end in sorted(ends) if _CODE.fullmatch(number_text(float(end)))]
+        others = known[~np.isin(known, codes)]
+        for code in codes if others.size else []:
+            if max(code - others.max(), others.min() - code) > 2 * np.ptp(others):
+                text = number_text(float(code))
+                notes.append(f"column {name} holds {text}: if that says that a value is missing, empty the cell")
+    return notes
 
 
 def _checked_name(what: str, text: str) -> str:

@@ -29,6 +29,8 @@ from probewise.recordings.columns import (
     a_command,
     is_commanded,
     led_cell,
+    notes_on_codes,
+    notes_on_names,
     pattern_codes,
     scan_codes_and_names,
     sessions_of_scans,
@@ -355,6 +357,8 @@ def _read_with_json(path: object, progress: Progress) -> tuple[Plan, FloatArray 
         sessions=sessions,
     )
     notes += [*_notes_on_far_place(table, "x_mm", plan.x_mm), *_notes_on_far_place(table, "y_mm", plan.y_mm)]
+    notes += notes_on_codes({"x_mm": plan.x_mm, "y_mm": plan.y_mm, **covariates})
+    notes += notes_on_names("scan", table.columns.get("scan", ()), "scans")
     if "reading" not in table.columns:
         return plan, None, notes
     # With a declared range a huge number is only unusable; without one it would spoil every sum.

@@ -33,7 +33,8 @@ from probewise.recordings.columns import (
     checked_covariates,
     columns_by_name,
     how_to_describe_pattern,
-    notes_on_numbers_as_names,
+    notes_on_codes,
+    notes_on_names,
     numbers_per_reading,
     numeric_covariates_and_notes,
     pattern_codes,
@@ -421,8 +422,9 @@ class Recording(ShowsItself):
                 is_moderate = not np.isfinite(values[k]) or abs(values[k]) <= largest
                 require(is_moderate, f"{name}[{k}]", float(values[k]), f"magnitudes up to {largest:g}")
         names = [name for name in ("scan", "pattern") if name in columns]
-        of_names = [note for name in names for note in notes_on_numbers_as_names(name, columns[name], f"{name}s")]
-        return replace(recording, notes=(*notes, *of_names, *recording.notes_on_unusable_readings()))
+        said = [note for name in names for note in notes_on_names(name, columns[name], f"{name}s")]
+        said += notes_on_codes(places | plan.covariates)
+        return replace(recording, notes=(*notes, *said, *recording.notes_on_unusable_readings()))
 
     def __len__(self) -> int:
         return len(self.plan)

@@ -39,7 +39,7 @@ from probewise.recordings.cells import (
 )
 from probewise.recordings.columns import (
     is_missing_value,
-    notes_on_numbers_as_names,
+    notes_on_names,
     require_one_order,
     text_of_name,
 )
@@ -112,7 +112,7 @@ class RunTable:
                 values, note = times_to_numbers(name, values, self.time_unit)
                 notes += [note] if note else []
             columns[name] = _checked_column(name, values, are_names=name == self.run)
-            notes += notes_on_numbers_as_names(name, given, "runs") if name == self.run else []
+            notes += notes_on_names(name, given, "runs") if name == self.run else []
             if name == self.run and 0 < np.count_nonzero(columns[name] == "") < len(columns[name]):
                 cure = "where an empty cell repeats the one above, fill it in"
                 notes += [f"the rows without a name in column {name} are taken for one run; {cure}"]

@@ -76,6 +76,7 @@ REFUSED = {
     f"{EXPLORE} --truth rectangle:500,250,100,60,2": "angle_rad of --truth ... is 2.0; allowed: 0 to 1.5708,",
     f"{EXPLORE} --truth ellipse:500,250,90,120,0.3": "semi_minor_mm of --truth ... is 120.0; allowed: 20 to 90,",
     f"{EXPLORE} --utility about:width_mm --quiet": "parameter is 'width_mm'; allowed: one of x_mm, y_mm, radius_mm",
+    "demo --out its_demo": "--out is 'its_demo/diagnosis'; allowed: a directory, existing or new",
     "demo --truth 600,260,40": "radius_mm of --truth ... is 40.0; allowed: 50 to 150,",
     f"{EXPLORE} --conceal bcklash:1": "did you mean backlash",
     f"{EXPLORE} --conceal battery_sag:1": "battery_mv among them",
@@ -219,6 +220,7 @@ def folder(tmp_path_factory):
         "thin.toml": geometry.replace("upper_mm = 350", "upper_mm = 1e-320"),
         **{f"held/{name}/{name}": "{}" for name in HELD},
         "its_csv/r.csv": "mine", "its_json/r.json": "mine", "its_png/card.png": "mine",
+        "its_demo/diagnosis": "mine",
     }  # fmt: skip
     for name, text in texts.items():
         (at / name).parent.mkdir(parents=True, exist_ok=True)

@@ -41,7 +41,8 @@ _CIRCLE = Circle(radius_mm=(50.0, 150.0), inside=True)
 
 def run(arguments: argparse.Namespace) -> int:
     """Calibrate, search and diagnose, write all files, and print the summary; return the exit status."""
-    out = checked_output_directory(arguments.out, main="answers.json")
+    out = checked_output_directory(arguments.out, DIAGNOSIS, main="answers.json")
+    checked_output_directory(out / DIAGNOSIS, main="diagnosis.json")
     hidden = HiddenShape.drawn_from_prior({"circle": _CIRCLE}, rng=np.random.default_rng([arguments.seed, 0]))
     if arguments.truth is not None:
         values = parse_finite_numbers("--truth", arguments.truth, 3, "X,Y,R in mm, such as 600,260,90")

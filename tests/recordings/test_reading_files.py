@@ -136,6 +136,11 @@ def test_an_orientation_beyond_a_full_turn_is_noted(tmp_path):
     assert read_recording(path).notes == ("row 3: orientation_deg is -9999, beyond a full turn: mistyped?",)
 
 
+def test_an_orientation_that_looks_like_radians_is_noted(tmp_path):
+    path = put(tmp_path, "x_mm,y_mm,orientation_deg,reading\n0,0,0,1\n1,0,1.571,2\n1,0,-.7854,2\n")
+    assert read_recording(path).notes == ("orientation_deg holds 1.571, in radians 90 degrees",)
+
+
 def test_numbers_that_stand_for_missing_ones_and_names_that_look_alike_are_noted(tmp_path):
     rows = [f"{x},0,{x},{8300 + x},20,{'aA'[x > 2]}" for x in range(5)]
     rows += ["999,0,6,-9999,20,A", "5,0,6,8301,-273.15,A"]

@@ -188,6 +188,7 @@ _OF_A_LIGHT_SENSOR = (
     "a header row with it, in a recording by a light sensor; a table of anything else needs --simulator FILE.py"
 )
 _FULL_TURN_DEG = 360.0
+_WHOLE_DEG = 0.05  # of radians of three decimals
 _FAR_AWAY = 100.0  # a place this many times the 5 to 95 % range of all places away looks mistyped
 PathLike = str | os.PathLike[str]
 
@@ -335,6 +336,10 @@ def _read_with_json(path: object, progress: Progress) -> tuple[Plan, FloatArray 
     if (beyond := np.flatnonzero(np.abs(orientation_deg) > _FULL_TURN_DEG)).size:
         k = int(beyond[0])
         notes.append(f"row {table.rows[k]}: orientation_deg is {orientation_deg[k]:g}, beyond a full turn: mistyped?")
+    in_degrees = np.degrees(orientation_deg[orientation_deg != 0])
+    off = np.maximum(np.abs(in_degrees - np.rint(in_degrees)), np.abs(in_degrees) - _FULL_TURN_DEG)
+    if off.size and off.max() < _WHOLE_DEG:
+        notes.append(f"orientation_deg holds {np.radians(in_degrees[0]):.4g}, in radians {in_degrees[0]:.0f} degrees")
     covariates = _covariate_columns(table, instrumentation.controls, notes)
     try:
         scan, scan_names = scan_codes_and_names(table.columns.get("scan"), len(table))

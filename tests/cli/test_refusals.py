@@ -190,6 +190,8 @@ REFUSED = {
     "arm fit-geometry --arm emulator:arm.toml --out arm.toml": "another file than the input arm.toml",
     "arm check --out new.png --drawing new.png": "--drawing is",
     "emulate-nxt --log card.csv --link small.csv": "small.csv",
+    "emulate-nxt --log new --link new": "--log is 'new'; allowed: another file",
+    "emulate-nxt --link its_link": "its_link: the path exists already",
     f"{FIT} --arm nxt:none --geometry arm.toml --marks arm.toml": "--marks is",
     "emulate-nxt --geometry arm.toml --log arm.toml": "--log is",
     "emulate-nxt --sensor sensor.json --log sensor.json": "--log is",
@@ -225,6 +227,7 @@ def folder(tmp_path_factory):
     for name, text in texts.items():
         (at / name).parent.mkdir(parents=True, exist_ok=True)
         (at / name).write_text(text)
+    (at / "its_link").symlink_to("small.csv")
     return at
 
 

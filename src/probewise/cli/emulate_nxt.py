@@ -26,7 +26,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise LinkError("emulate-nxt needs pseudo-terminals, which Linux, macOS and WSL have and this system lacks")
     from probewise.emulator.radio import Terminal, serve
 
-    log = arguments.log and checked_output_file(arguments.log, arguments.sensor, arguments.geometry, option="--log")
+    taken = (arguments.sensor, arguments.geometry, arguments.link)
+    log = arguments.log and checked_output_file(arguments.log, *taken, option="--log")
     file = arguments.geometry or shipped_geometry_path()
     read_geometry(file)  # the emulator takes numbers from a file without a fault
     geometry = emulator.read_geometry(file)

@@ -273,8 +273,8 @@ class Terminal:
     """
 
     def __init__(self, link: Path | None = None) -> None:
-        if link is not None and link.exists() and not link.is_symlink():
-            raise FileError(link, "the path exists already", "a new name, or a symbolic link to replace")
+        if link is not None and link.exists() and not (link.is_symlink() and link.is_char_device()):
+            raise FileError(link, "the path exists already", "a new name, or a symbolic link to a device, to replace")
         self._link = link
         self._open_terminal()
 

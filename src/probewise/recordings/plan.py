@@ -423,7 +423,7 @@ class Recording(ShowsItself):
                 require(is_moderate, f"{name}[{k}]", float(values[k]), f"magnitudes up to {largest:g}")
         names = [name for name in ("scan", "pattern") if name in columns]
         said = [note for name in names for note in notes_on_names(name, columns[name], f"{name}s")]
-        said += notes_on_codes(places | plan.covariates)
+        said += notes_on_codes({**places, **plan.covariates})
         return replace(recording, notes=(*notes, *said, *recording.notes_on_unusable_readings()))
 
     def __len__(self) -> int:

@@ -61,6 +61,16 @@ def test_too_little_is_few_readings_or_equal_ones():
     assert prepare(replace(whole, readings=np.full(408, 5.0)), apparatus=SENSOR).has_too_little_data
 
 
+def test_readings_that_a_given_sensor_predicts_worse_than_their_mean_are_noted():
+    theta = np.array([1.0, 0.5, 1.5, 0.03, 0.08, -0.005, 11.0, 58.0])
+    samples = theta + 1e-3 * RNG.standard_normal((500, 8))
+    sensor = sensor_of(samples, noise_sd=np.full(500, 0.5), instrumentation=paper_plan().instrumentation)
+    own = predict(sensor, paper_plan()).mean
+    for readings, n_notes in ((own, 0), (own + 9.0 * RNG.standard_normal(len(own)), 0), (69.0 - own, 1)):
+        found = prepare(Recording(paper_plan(), readings), sensor=sensor, apparatus=SENSOR)
+        assert sum("worse than their mean" in note for note in found.recording.notes) == n_notes
+
+
 def test_a_sensor_of_another_height_reads_the_plan_at_the_height_it_declares():
     """As readings of the calibration's height that command it; the plan itself stays as it was declared."""
     theta = np.array([1.0, 0.5, 1.5, 0.03, 0.08, -0.005, 11.0, 58.0])

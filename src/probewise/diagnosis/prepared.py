@@ -179,6 +179,7 @@ def _is_same_recording(one: Recording, other: Recording) -> bool:
 
 MOST_DIAGNOSED_READINGS = 2400
 _STRETCH = 6  # readings
+_CONTRAST = 5.0  # sds of the noise, of readings that a sensor can be seen not to predict
 _SEED = 0  # the same rows of the same recording, whatever the seed of its diagnosis
 
 
@@ -309,6 +310,11 @@ def prepare(
     if sensor is not None:
         require_same_unit(sensor, everything.plan)
         null = sensor_from_samples(sensor)
+        there = Model(null, (), everything.plan).predict(np.zeros((1, null.n_params)))[0]
+        usable, read = everything.usable, everything.readings
+        if np.mean((read - there)[usable] ** 2) > np.var(read[usable]) > (_CONTRAST * rough_sd(everything)) ** 2:
+            note = "the sensor given predicts these readings worse than their mean does: are they its own?"
+            everything = replace(everything, notes=(*everything.notes, note))
     rows = rows_to_diagnose(everything)
 
     def chosen() -> Recording:

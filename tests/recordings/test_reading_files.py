@@ -136,7 +136,9 @@ def test_an_orientation_beyond_a_full_turn_is_noted(tmp_path):
     assert read_recording(path).notes == ("row 3: orientation_deg is -9999, beyond a full turn: mistyped?",)
 
 
-def test_an_orientation_that_looks_like_radians_is_noted(tmp_path):
+def test_places_and_orientations_in_other_units_are_noted(tmp_path):
+    path = put(tmp_path, "x_mm,y_mm,reading\n0,0,1\n0.12,0,1\n")
+    assert read_recording(path).notes == ("all places lie within 0.12 mm: are x_mm and y_mm in metres?",)
     path = put(tmp_path, "x_mm,y_mm,orientation_deg,reading\n0,0,0,1\n1,0,1.571,2\n1,0,-.7854,2\n")
     assert read_recording(path).notes == ("orientation_deg holds 1.571, in radians 90 degrees",)
 

@@ -189,6 +189,7 @@ _OF_A_LIGHT_SENSOR = (
 )
 _FULL_TURN_DEG = 360.0
 _WHOLE_DEG = 0.05  # of radians of three decimals
+_IN_METRES_MM = 0.5  # of a sensor whose readings change within millimetres
 _FAR_AWAY = 100.0  # a place this many times the 5 to 95 % range of all places away looks mistyped
 PathLike = str | os.PathLike[str]
 
@@ -362,6 +363,8 @@ def _read_with_json(path: object, progress: Progress) -> tuple[Plan, FloatArray 
         sessions=sessions,
     )
     notes += [*_notes_on_far_place(table, "x_mm", plan.x_mm), *_notes_on_far_place(table, "y_mm", plan.y_mm)]
+    if 0 < (span_mm := max(np.ptp(plan.x_mm), np.ptp(plan.y_mm))) < _IN_METRES_MM:
+        notes.append(f"all places lie within {span_mm:.2g} mm: are x_mm and y_mm in metres?")
     notes += notes_on_codes({"x_mm": plan.x_mm, "y_mm": plan.y_mm, **covariates})
     notes += notes_on_names("scan", table.columns.get("scan", ()), "scans")
     if "reading" not in table.columns:

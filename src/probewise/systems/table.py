@@ -207,7 +207,7 @@ class RunTable:
                 before, at = rows[falls[0]], rows[falls[0] + 1]
                 where = f"column {self.time!r} in row {self.row_name(at)}"
                 anew = 'its run; where it begins anew name the runs: run = "..."'
-                own = anew if self.run is None else f"run {name}; sort the rows"
+                own = anew if self.run is None else f"run {name}; sort the rows, or mend a clock that was set back"
                 allowed = f"{self.time_s[before]:g} or more, since time does not fall within {own}"
                 raise ParameterError(where, float(self.time_s[at]), allowed)
 

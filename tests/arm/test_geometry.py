@@ -111,11 +111,10 @@ def test_the_count_at_a_stop_has_the_play_on_its_side(stop_rad, side, counts):
     assert joint.stop_counts == counts
 
 
-GEOMETRY = read_geometry(shipped_geometry_path())
 BLOCK_MM = 32.0
 
 
-def built(base=2.0, shoulder=-2.0, elbow=-2.0, off_mm=3.0, geometry=GEOMETRY):
+def built(base=2.0, shoulder=-2.0, elbow=-2.0, off_mm=3.0, geometry=SHIPPED):
     """The arm as it really is: home angles and lengths differ from those of the file."""
     joints = {
         name: dataclasses.replace(getattr(geometry, name), home_rad=getattr(geometry, name).home_rad + math.radians(by))
@@ -136,7 +135,7 @@ def homes(geometry):
 
 
 def touched(true, *, noise_mm=0.0, rng=None, marks=None):
-    marks = spread_mark_places(GEOMETRY) if marks is None else marks
+    marks = spread_mark_places(SHIPPED) if marks is None else marks
     turned = true.angles_rad(marks, BLOCK_MM) - homes(true)
     places = np.column_stack([marks, np.full(len(marks), BLOCK_MM)])
     if noise_mm:
@@ -146,17 +145,17 @@ def touched(true, *, noise_mm=0.0, rng=None, marks=None):
 
 def errors_mm(fitted, true):
     """Where the sensor really is, less where it is sent, all over the field: (n, 3)."""
-    places = GEOMETRY.reachable_grid_mm
+    places = SHIPPED.reachable_grid_mm
     places = places[fitted.contains(places)]
-    angles = fitted.angles_rad(places, GEOMETRY.read_height_mm) - homes(fitted) + homes(true)
-    return true.position_mm(angles) - np.column_stack([places, np.full(len(places), GEOMETRY.read_height_mm)])
+    angles = fitted.angles_rad(places, SHIPPED.read_height_mm) - homes(fitted) + homes(true)
+    return true.position_mm(angles) - np.column_stack([places, np.full(len(places), SHIPPED.read_height_mm)])
 
 
 @pytest.mark.parametrize("signs", [(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)])
 def test_two_degrees_and_three_mm_are_found(signs):
     true = built(*(2.0 * sign for sign in signs))
-    assert np.abs(errors_mm(GEOMETRY, true)).max() > 15  # as the file stands
-    fitted = fit_geometry(GEOMETRY, *touched(true)).geometry
+    assert np.abs(errors_mm(SHIPPED, true)).max() > 15  # as the file stands
+    fitted = fit_geometry(SHIPPED, *touched(true)).geometry
     off = errors_mm(fitted, true)
     assert np.abs(off[:, :2]).max() < 1.0
     assert np.abs(off[:, 2]).max() < 1.0
@@ -169,7 +168,7 @@ def test_claimed_sds_hold_over_many_arms():
     place, height = [], []
     for _ in range(100):
         true = built(*rng.normal(0.0, 2.0, 3), off_mm=float(rng.normal(0.0, 3.0)))
-        found = fit_geometry(GEOMETRY, *touched(true, noise_mm=1.0, rng=rng)).geometry
+        found = fit_geometry(SHIPPED, *touched(true, noise_mm=1.0, rng=rng)).geometry
         off = errors_mm(found, true)
         place.append((off[:, :2] ** 2).mean() / found.accuracy.place_sd_mm**2)
         height.append((off[:, 2] ** 2).max() / found.accuracy.height_sd_mm**2)
@@ -180,7 +179,7 @@ def test_claimed_sds_hold_over_many_arms():
 def test_a_mark_that_was_only_seen_gives_its_place():
     turned, places = touched(built())
     places[::3, 2] = np.nan
-    found = fit_geometry(GEOMETRY, turned, places)
+    found = fit_geometry(SHIPPED, turned, places)
     assert np.isnan(found.residuals_mm[0, 2])
     assert found.geometry.links_mm[0] == pytest.approx(353, abs=2.5)
 
@@ -189,36 +188,36 @@ def test_the_mark_that_disagrees_is_named():
     turned, places = touched(built())
     places[3, 0] += 12
     with pytest.raises(MarksDisagreeError, match=r"all but mark 4 agree, and it is 1\d mm off: bring the sensor there"):
-        fit_geometry(GEOMETRY, turned, places)
+        fit_geometry(SHIPPED, turned, places)
 
 
 def test_marks_that_no_arm_explains_are_refused():
     turned, places = touched(built())
     places[:, 0] = places[::-1, 0]
     with pytest.raises(MarksDisagreeError, match="gears that do not slip"):
-        fit_geometry(GEOMETRY, turned, places)
+        fit_geometry(SHIPPED, turned, places)
 
 
 def test_marks_that_do_not_determine_the_geometry_are_refused():
     near = np.array([[500.0 + 10 * k, 300.0] for k in range(6)])
     turned, places = touched(built(), marks=near)
     with pytest.raises(ParameterError, match=r"6 that leave the height open.*near and far from the base"):
-        fit_geometry(GEOMETRY, turned, places)
+        fit_geometry(SHIPPED, turned, places)
     seen, places = touched(built())
     places[:, 2] = np.nan
     with pytest.raises(ParameterError, match=r"8 that leave the height open to \d\d.\d mm and the place to 1.\d mm"):
-        fit_geometry(GEOMETRY, seen, places)
+        fit_geometry(SHIPPED, seen, places)
     with pytest.raises(ParameterError, match="marks is 4; allowed: 5 or more"):
-        fit_geometry(GEOMETRY, turned[:4], places[:4])
+        fit_geometry(SHIPPED, turned[:4], places[:4])
 
 
 def test_the_file_keeps_its_comments_and_reads_back_as_fitted(tmp_path):
     text = shipped_geometry_path().read_text(encoding="utf-8")
-    fitted = fit_geometry(GEOMETRY, *touched(built())).geometry
+    fitted = fit_geometry(SHIPPED, *touched(built())).geometry
     (tmp_path / "arm.toml").write_text(text_with_fitted_values(text, fitted), encoding="utf-8")
     back = read_geometry(tmp_path / "arm.toml")
     assert "# shoulder to elbow" in (tmp_path / "arm.toml").read_text(encoding="utf-8")
-    assert back.accuracy.marks == len(spread_mark_places(GEOMETRY))
+    assert back.accuracy.marks == len(spread_mark_places(SHIPPED))
     np.testing.assert_allclose(homes(back), homes(fitted), atol=1e-6)
     np.testing.assert_allclose(
         [*back.links_mm, *back.axis_mm, *back.shoulder_mm],
@@ -226,7 +225,7 @@ def test_the_file_keeps_its_comments_and_reads_back_as_fitted(tmp_path):
         atol=1e-4,
     )
     # What a motor may turn is as it was: limits are counted from home.
-    for was, is_ in zip(GEOMETRY.joints, back.joints, strict=True):
+    for was, is_ in zip(SHIPPED.joints, back.joints, strict=True):
         assert is_.high_rad - is_.home_rad == pytest.approx(was.high_rad - was.home_rad, abs=1e-5)
     again = text_with_fitted_values((tmp_path / "arm.toml").read_text(encoding="utf-8"), fitted)
     assert again.count("[accuracy]") == 1
@@ -244,7 +243,7 @@ def test_a_number_that_cannot_be_replaced_in_its_file_is_refused(line, instead, 
     text = shipped_geometry_path().read_text(encoding="utf-8")
     assert line in text
     with pytest.raises(ParameterError, match=rf"{name} is 'written in another way'; allowed: .* on a line of its own"):
-        text_with_fitted_values(text.replace(line, instead, 1), GEOMETRY)
+        text_with_fitted_values(text.replace(line, instead, 1), SHIPPED)
 
 
 def test_marks_come_back_from_their_file(tmp_path):
@@ -260,10 +259,10 @@ def test_marks_come_back_from_their_file(tmp_path):
 
 def test_what_a_wrong_home_costs_is_told_from_the_geometry():
     """Both links two degrees off, worked out by moving them; a fitted geometry knows better."""
-    places = GEOMETRY.reachable_grid_mm
-    angles = GEOMETRY.angles_rad(places, 14.0)
+    places = SHIPPED.reachable_grid_mm
+    angles = SHIPPED.angles_rad(places, 14.0)
     lower = angles - np.radians([0.0, 2.0, 2.0])
-    sinks = 14.0 - GEOMETRY.position_mm(lower)[:, 2]
-    assert GEOMETRY.max_height_error_mm == pytest.approx(sinks.max(), rel=0.05)
-    fitted = fit_geometry(GEOMETRY, *touched(built())).geometry
+    sinks = 14.0 - SHIPPED.position_mm(lower)[:, 2]
+    assert SHIPPED.max_height_error_mm == pytest.approx(sinks.max(), rel=0.05)
+    fitted = fit_geometry(SHIPPED, *touched(built())).geometry
     assert fitted.max_height_error_mm == 2 * fitted.accuracy.height_sd_mm < 6

@@ -276,27 +276,19 @@ def test_where_no_readings_separate_the_named_hypotheses_the_verdict_says_so():
     assert diagnosis.next_measurement is None
 
 
-PREPARED = prepare_system(SIMULATOR, runs(rng=np.random.default_rng(3), n=20))
-RECORDING, PLAN, APPARATUS_OF_ALIASES = PREPARED.recording, PREPARED.recording.plan, PREPARED.apparatus
-LAW = white_noise_of_recording(RECORDING)
-FOUND = fit(Model(cast(Any, PREPARED.null), (), PLAN), RECORDING, cast(Any, PREPARED.null).first, LAW)
-PROBLEM = Linearised.of(FOUND, LAW)
-NOTHING = APPARATUS_OF_ALIASES.words.settles_nothing
-
-
-def advised(*names: str) -> Alias:
-    entries = {name: (PREPARED.effects[name], PREPARED.effects[name].entries[0]) for name in names}
-    pair = Alias(cast(Any, names), 1.0, NOTHING, 0)
-    (found,) = pairs_with_separating_scans(
-        [pair], PROBLEM, FOUND, entries, np.arange(len(RECORDING.readings)), APPARATUS_OF_ALIASES
-    )
-    return found
-
-
 def test_a_value_per_run_separates_nothing_that_a_start_of_each_run_absorbs():
     """An offset of each run and a start of each run are the same in a new run too, which has one of each."""
-    alias = advised("offset_per_run", "depends:start_c:room_c")
-    assert (alias.settle_by, alias.readings) == (NOTHING, 0)
+    prepared = prepare_system(SIMULATOR, runs(rng=np.random.default_rng(3), n=20))
+    system, recording = cast(Any, prepared.null), prepared.recording
+    law = white_noise_of_recording(recording)
+    found = fit(Model(system, (), recording.plan), recording, system.first, law)
+    names = "offset_per_run", "depends:start_c:room_c"
+    entries = {name: (prepared.effects[name], prepared.effects[name].entries[0]) for name in names}
+    nothing = prepared.apparatus.words.settles_nothing
+    alike = [Alias(names, 1.0, nothing, 0)]
+    rows = np.arange(len(recording.readings))
+    (alias,) = pairs_with_separating_scans(alike, Linearised.of(found, law), found, entries, rows, prepared.apparatus)
+    assert (alias.settle_by, alias.readings) == (nothing, 0)
 
 
 def without_controls():

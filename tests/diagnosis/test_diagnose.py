@@ -20,7 +20,6 @@ from probewise.experiment import experiment_for
 from probewise.recordings import Plan, Recording, paper_plan, two_way_plan
 from probewise.scene import Circle, Field
 from probewise.world import concealed as hidden
-from probewise.world.concealed import offset_drift
 from probewise.world.spots import Blob, gaussian_spot
 from probewise.world.world import World
 
@@ -258,18 +257,13 @@ def test_without_an_alarm_nothing_is_named_and_predictions_are_averaged_all_the_
     assert np.mean(amp != 0) == pytest.approx(found.hypotheses[0].probability, abs=0.05)
 
 
-PLAN = paper_plan()
-SPOT = gaussian_spot([Blob(1.0, (1.5, 2.5), (6.0, 8.0), 0.2)])
-RECORDING = World(SPOT, concealed=(offset_drift(6.0),)).simulate(PLAN, rng=np.random.default_rng(0))
-
-
 @pytest.mark.slow
 def test_the_effect_chosen_is_fitted():
-    found = model_with(RECORDING, ["offset_drift"], rng=np.random.default_rng(1))
+    drifted = recording("paper", hidden.offset_drift(6.0))
+    found, plain = (model_with(drifted, names, rng=np.random.default_rng(1)) for names in (["offset_drift"], []))
     assert found.effects == ("offset_drift",)
     drift = found.effect_samples("offset_drift")[:, 0]
     assert abs(drift.mean() - 6.0) < 4 * drift.std()
-    plain = model_with(RECORDING, [], rng=np.random.default_rng(1))
     assert plain.effects == ()
     assert found.noise_sd.mean() < plain.noise_sd.mean()
 
@@ -277,4 +271,4 @@ def test_the_effect_chosen_is_fitted():
 @pytest.mark.parametrize("name", ["hum", "dropouts"])
 def test_a_name_that_cannot_be_and_lost_readings_of_which_there_is_none_are_refused(name):
     with pytest.raises(ParameterError, match=name):
-        model_with(RECORDING, [name], rng=np.random.default_rng(1))
+        model_with(recording("paper", hidden.offset_drift(6.0)), [name], rng=np.random.default_rng(1))

@@ -110,11 +110,6 @@ def test_settings_of_a_bank_lie_within_the_prior_and_some_can_be_seen(name):
     assert change > 0.01 * SD
 
 
-@pytest.mark.parametrize(("level", "cut"), [(0.9, np.minimum), (-0.9, np.maximum)])
-def test_saturation_is_a_ceiling_above_the_middle_of_the_readings_and_a_floor_below(level, cut):
-    np.testing.assert_allclose(_read("saturation", level), cut(NOTHING, level))
-
-
 @pytest.mark.parametrize("wild", [-99.0, 99.0])
 def test_one_wild_reading_hides_no_ceiling(wild):
     readings = np.minimum(NOTHING, 1.2) + SD * np.random.default_rng(0).standard_normal(N_ROWS)
@@ -150,16 +145,6 @@ def test_a_gain_counts_from_the_reading_of_nothing():
     about = _about(_simulator(**how, noise=Noise(sd=SD, zero=1.0)))
     found = _read("gain_drift", 0.1, about=about, forms=bind_forms(about))
     np.testing.assert_allclose(found, 1.0 + (about.predicted - 1.0) * (1 + 0.1 * _T))
-
-
-def test_an_input_delay_looks_the_column_up_as_it_was():
-    """Closed form: a column on straight lines between rows, 0.4 s earlier, as at the start before it."""
-    expected = NOTHING.copy()
-    half = N_ROWS // 2
-    for rows in (slice(0, half), slice(half, N_ROWS)):
-        drive = np.interp(_T[rows] - 0.4, _T[rows], TABLE.columns["drive"][rows])
-        expected[rows] = ABOUT.theta[0, 0] + ABOUT.theta[0, 1] * drive
-    np.testing.assert_allclose(_read("input_delay:drive", 0.4), expected, atol=1e-12)
 
 
 def test_an_extra_effect_of_a_file_is_bound_with_its_own_prior_and_sentence():

@@ -19,7 +19,7 @@ from probewise.effects import EFFECTS, VOCABULARY, Extent, HeavyTailedPrior
 from probewise.effects.effect import PHASE, sine_and_cosine_entries
 from probewise.nested.importance import Repartitioned
 from probewise.priors import Normal, Product, Uniform
-from probewise.recordings import Plan, Recording, paper_plan
+from probewise.recordings import HalfPlane, Plan, Recording, paper_plan
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FixedLevels
 
@@ -30,16 +30,7 @@ def line_recording(step: float) -> Recording:
     """Forty readings of a line with noise of sd 0.3, and a step half way."""
     n = 40
     time = np.arange(n, dtype=np.float64)
-    plan = Plan(
-        x_mm=np.zeros(n),
-        y_mm=np.zeros(n),
-        orientation_rad=np.zeros(n),
-        time_s=time,
-        scan=np.zeros(n, dtype=int),
-        scan_names=("only",),
-        pattern=np.zeros(n, dtype=int),
-        pattern_names=("nothing",),
-    )
+    plan = Plan.from_arrays(x_mm=np.zeros(n), y_mm=0.0, time_s=time, patterns={"edge": HalfPlane(0.0, 0.0)}, unit="V")
     noise = 0.3 * np.random.default_rng(7).standard_normal(n)
     return Recording(plan, 1.0 + 0.05 * time + step * (time > 19.5) + noise)
 

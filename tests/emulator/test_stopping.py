@@ -53,6 +53,7 @@ def test_nothing_stays_on_whatever_stops_which_command_when(task, stop, emulator
             stdout=own,
             stderr=own,
             preexec_fn=lambda: _lead(own),
+            env={name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"},  # as a person's
         )
         os.close(own)
         os.write(terminal, b"\n" * 3)  # a person who has done what is asked

@@ -67,12 +67,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _discard_unwritable_output() -> None:
     """Send output that can no longer be written to the null device, so that the interpreter's flush at exit works."""
-    try:
-        sys.stdout.flush()
-    except CLOSED:
-        return
-    except OSError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except CLOSED:
+            pass
+        except OSError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _write_warning(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:

@@ -237,7 +237,7 @@ class World:
 class Reader:
     """A world that is read place after place: effects of the way there and of earlier readings act.
 
-    The noise of the k-th reading is by the seed (*`seed`, k), with k from `first`.
+    The noise of each reading has a seed of its own: `seed`, followed by the reading's number, from `first` on.
     """
 
     def __init__(self, world: World, *, seed: Sequence[int], first: int = 0) -> None:

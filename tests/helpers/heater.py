@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from probewise.systems import FittedSystem, Noise, RunTable, Simulator, System
-from probewise.systems.forms import ReferenceFit, bind_forms, extract_stored_fit
+from probewise.systems.forms import ReferenceFit, bind_forms
 
 FILE = """\
 import numpy as np
@@ -77,6 +77,6 @@ def fitted(effects=(), *, seed=0):
         samples=samples,
         noise_sd=np.full(500, 0.05),
         effects=tuple(effect.name for effect in chain.effects),
-        known=extract_stored_fit(ABOUT) if effects else None,
+        known=ABOUT.stored if effects else None,
         level=(20.0, 30.0),
     )

@@ -21,7 +21,7 @@ from probewise.systems import (
     predict_system,
     write_system_prediction,
 )
-from probewise.systems.forms import ReferenceFit, StoredFit, bind_forms, extract_stored_fit, rebind_forms
+from probewise.systems.forms import ReferenceFit, StoredFit, bind_forms, rebind_forms
 from probewise.systems.prediction import as_recording
 
 RNG = 7
@@ -150,7 +150,7 @@ def _step_without_a_time():
 def _model_with_a_step_at_a_row():
     about = _step_without_a_time()
     values = {"a": 1.0, "offset_step.a": 2.0, "offset_step.at_row": _STEP_AT}
-    return known_model(about.system.simulator, values, extract_stored_fit(about)), about.table
+    return known_model(about.system.simulator, values, about.stored), about.table
 
 
 @pytest.mark.parametrize("rows", [(5, 20), (20, 40), (39, 40), (0, 1)], ids=["middle", "second file", "last", "first"])
@@ -192,7 +192,7 @@ def test_an_effect_with_a_memory_goes_on_after_a_row_that_lacks_an_input(effect)
         names=names,
         samples=np.concatenate([model.samples, setting], axis=1),
         effects=(effect,),
-        known=extract_stored_fit(about),
+        known=about.stored,
     )
     whole = predicted(model, table).mean
     with pytest.warns(DoubtfulResultWarning, match=r"1 row .* first row 3"):
@@ -396,7 +396,7 @@ def test_fewer_than_500_samples_are_refused():
 def test_every_form_that_is_bound_again_does_what_it_did():
     """About the fit and from what is in the file, with any parameters: the same readings, to the last bit."""
     forms = bind_forms(ABOUT)
-    again = rebind_forms(forms, SIMULATOR, extract_stored_fit(ABOUT))
+    again = rebind_forms(forms, SIMULATOR, ABOUT.stored)
     assert again.keys() == forms.keys()
     rng = np.random.default_rng(3)
     for name, form in forms.items():
@@ -416,7 +416,7 @@ def test_a_bend_that_is_bound_again_ends_where_it_did_whatever_the_unit():
     system = System.of(simulator, table)
     about = ReferenceFit(system, table, np.clip(ndtri(np.array([0.3])), -5, 5), 0.02)
     theta = np.array([[3.0, 0.1, 3.0]])
-    known = extract_stored_fit(about)
+    known = about.stored
     first = bind_forms(about)["nonlinearity"]
     (second,) = rebind_forms(["nonlinearity"], simulator, known).values()
     predicted, again = (system.chain(table, [form]).predict(theta, table) for form in (first, second))

@@ -54,7 +54,7 @@ from probewise.progress import Progress, silent
 from probewise.recordings.plan import Plan, Recording, require_patterns_described, require_plan
 from probewise.sensor import Stage
 from probewise.systems import RunTable, Simulator, System, as_recording, table_for
-from probewise.systems.forms import ReferenceFit, bind_forms, driving_columns
+from probewise.systems.forms import ReferenceFit, bind_forms
 from probewise.systems.system import STANDS_STILL, with_converged_step
 
 ALIAS = math.sqrt(1 - 2 * ENOUGH_NATS / LAMBDA**2)  # the cosine at which the evidence is ENOUGH_NATS
@@ -629,7 +629,7 @@ def _reasons_for_absence(about: ReferenceFit) -> dict[str, str]:
         out[f"sensitivity:{column}"] = "the column does not vary"
         out[f"curve:{column}"] = "it has fewer than three values"
         out[f"friction:{column}"] = "the column does not move both ways"
-    for column in driving_columns(about):
+    for column in about.driving_columns:
         out |= {f"{kind}:{column}": nothing for kind in ("input_offset", "input_gain", "input_saturation", "dead_zone")}
         out |= {f"backlash:{column}": f"{column} does not turn back", f"input_delay:{column}": timeless}
         out |= {f"periodic_error:{column}": "the column has too few values"}

@@ -34,7 +34,7 @@ from probewise.nested.importance import repartitioned
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Recording
 from probewise.systems import FittedSystem, RunTable, Simulator, System, table_for
-from probewise.systems.forms import ReferenceFit, extract_stored_fit
+from probewise.systems.forms import ReferenceFit
 from probewise.systems.table import table_digest
 
 
@@ -84,7 +84,7 @@ def fitted_system_from_samples(
         level=(float(np.min(level)), float(np.max(level))),
         max_step=system.max_step,
         stiff=system.stiff,
-        known=extract_stored_fit(about) if needed else None,
+        known=about.stored if needed else None,
         recording=table_digest(cast(RunTable, recording.plan)),
         source=recording.source,
         notes=recording.notes,
@@ -239,7 +239,7 @@ def fit_simulator(
     sd = np.sqrt(predicted.var(axis=0) + np.mean(noise_sd**2) * recording.relative_sd**2)
     fitted = fitted_system_from_samples(about, samples, recording, mean)
     fitted = replace(fitted, best=tuple(system.theta(modes[:1])[0].tolist()))
-    evidence = Evidence(draws.log_z, max(draws.log_z_error, 1e-3), "importance sampling")
+    evidence = Evidence(draws.log_z, max(draws.log_z_error, 1e-3), "importance sampling")  # no error is surely less
     beside = _nested(problem, z, rng=rng, progress=progress) if thorough else None
     if system.caller is not None:
         system.caller.on_call = None

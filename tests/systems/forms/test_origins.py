@@ -8,7 +8,7 @@ from probewise.diagnosis import diagnose_system
 from probewise.effects import name_without_copy_suffix
 from probewise.effects.effect import sentence_from_samples
 from probewise.systems import FittedSystem, Law, RunTable, Simulator, System, predict_system
-from probewise.systems.forms import ReferenceFit, bind_forms, extract_stored_fit
+from probewise.systems.forms import ReferenceFit, bind_forms
 from probewise.systems.forms.formulas import formula_forms
 
 EPOCH = 1.7e9  # s, a multiple of 2^-20 away from any of the times
@@ -95,7 +95,7 @@ def test_a_model_keeps_the_origin_of_its_recording_for_other_tables_and_through_
     about = _about(EPOCH, 0.0, _function)
     values = {"offset": 1.0, "gain": 2.0, "interference.a": 0.5, "interference.hz": 0.3, "interference.phase": 0.4}
     values |= {"offset_drift.a": 0.1}
-    model = known_model(about.system.simulator, values, extract_stored_fit(about), sd=0.01)
+    model = known_model(about.system.simulator, values, about.stored, sd=0.01)
     later = _table(EPOCH + 1e5)  # its own origin would be another one
     since = later.columns["t_s"] - EPOCH
     expected = 1.0 + 2.0 * _DRIVE + 0.5 * np.sin(2 * np.pi * 0.3 * since + 0.4) + 0.1 * since

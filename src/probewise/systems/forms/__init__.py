@@ -18,7 +18,7 @@ from probewise.effects.effect import Effect, StepEffect, WaveEffect
 from probewise.errors import require
 from probewise.priors import LogUniform
 from probewise.systems.forms.formulas import formula_forms
-from probewise.systems.forms.inputs import driving_columns, forms_on_inputs, forms_on_rates, sorting_column
+from probewise.systems.forms.inputs import forms_on_inputs, forms_on_rates, sorting_column
 from probewise.systems.forms.modulations import forms_of_extras, forms_on_parameters
 from probewise.systems.forms.readings import forms_on_readings
 from probewise.systems.forms.reference import ReferenceFit, StoredFit
@@ -26,7 +26,7 @@ from probewise.systems.simulator import Simulator
 from probewise.systems.system import System
 from probewise.systems.table import covariate_of_column
 
-__all__ = ["WORDS", "ReferenceFit", "StoredFit", "bind_forms", "bind_proposals", "driving_columns", "sorting_column"]
+__all__ = ["WORDS", "ReferenceFit", "StoredFit", "bind_forms", "bind_proposals", "sorting_column"]
 
 WORDS: Mapping[str, str] = MappingProxyType(
     {
@@ -89,10 +89,9 @@ def bind_proposals(about: ReferenceFit) -> dict[str, Effect]:
 
 def _by_name(about: ReferenceFit, forms: Iterable[Effect]) -> dict[str, Effect]:
     """Return forms by name; a pickled one finds its functions again by that, bound to what is stored of the fit."""
-    known = extract_stored_fit(about) if about.known is None else about.known
 
     def restorable(form: Effect) -> Effect:
-        source = partial(_form_again, form.name, about.system.simulator, known)
+        source = partial(_form_again, form.name, about.system.simulator, about.stored)
         variants = tuple(restorable(other) for other in form.alternatives)
         return replace(form, alternatives=variants, binding=replace(form.binding, source=source))
 
@@ -126,12 +125,6 @@ def names_in_definitions(about: ReferenceFit, names: Iterable[str]) -> frozenset
         if kind in _IN_RATES and target[0] in about.states_with_rates_by_definition:
             out.add(name)
     return frozenset(out)
-
-
-def extract_stored_fit(about: ReferenceFit) -> StoredFit:
-    """Return the part of a reference fit from which its forms can be bound again."""
-    held = tuple(name for name in driving_columns(about) if about.is_held_between_rows(name))
-    return StoredFit(about.table, about.predicted, about.sd, about.states, held)
 
 
 def rebind_forms(

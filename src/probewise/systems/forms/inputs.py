@@ -40,24 +40,12 @@ from probewise.systems.forms.reference import ReferenceFit, clipping_between, pe
 from probewise.systems.law import LawWithEffects, Limit
 from probewise.systems.table import covariate_of_column
 
-_NUDGE = 1e-4  # of a column's spread: the step that tests whether it drives the readings
 _MOST_FREQUENCIES = 600
 _MOST_FREQUENCIES_CALLED = 96  # where each is two calls of a person's function
 _ROWS_OF_A_WAVE = 4  # least distinct values per period on average: with fewer, some wave fits any readings
 _LEAST_WAVES = 1.5  # in a column's range: half a period is seen again; any bend is a part of a slower wave
 _NEAR_ZERO = 0.1  # of a column's range: largest dead zone
 _FORTH_AND_BACK = 0.02  # least share of rows that move in each direction
-
-
-def driving_columns(about: ReferenceFit) -> list[str]:
-    """Return the names of the columns, except time, that the simulated readings depend on."""
-    out = []
-    for name, values in about.varying_columns.items():
-        sizes = (_with_offset, _NUDGE * float(np.nanstd(values))), (_with_gain, _NUDGE)
-        acts = ((_column_changer(name, change), np.array([[size]])) for change, size in sizes)
-        if max([float(about.rms_change_in_sds(Stage.INPUT, *each)[0]) for each in acts]) > 0:
-            out.append(name)
-    return out
 
 
 def sorting_column(about: ReferenceFit, *, in_runs: bool = False) -> str | None:
@@ -74,12 +62,12 @@ def sorting_column(about: ReferenceFit, *, in_runs: bool = False) -> str | None:
     counted = np.diff(table.scan) == 0 if in_runs else np.full(len(table) - 1, True)
     changes = {name: np.diff(values)[counted] for name, values in table.covariates.items() if np.ptp(values) > 0}
     ordered = {name for name, change in changes.items() if np.all(change >= 0) or np.all(change <= 0)}
-    return next((name for name in driving_columns(about) if name in ordered), None) if ordered else None
+    return next((name for name in about.driving_columns if name in ordered), None) if ordered else None
 
 
 def forms_on_inputs(about: ReferenceFit) -> Iterator[Effect]:
     """Yield a form for each possible error of the columns that drive the simulator, and of the clock."""
-    for name in driving_columns(about):
+    for name in about.driving_columns:
         yield from _forms_on_column(about, name)
     time = about.table.time
     if time is not None:

@@ -40,6 +40,7 @@ _ROWS_OF_A_RUN = 3  # least rows per run on average
 UNSEEN = 1e-7  # of the noise sd: a smaller change of the readings counts as none
 _GROWTH = (1.0, 1e9, 1e18, 1e27, 1e36)  # of an amplitude, until the readings change
 _NUDGE = 1e-3  # of a state's range
+_NUDGE_OF_COLUMN = 1e-4  # of its spread or values: the step that tests whether it drives the readings
 _N_COMPARED = 64  # states and parameters at which a rate is compared with another state
 N_SIZES = 9  # in the bank of a form of one size
 _LEAST, _MOST = 0.05, 1e4  # rms change in noise sds between which sizes without an amplitude are searched
@@ -252,6 +253,29 @@ class ReferenceFit:
         """Columns of numbers that vary, (n_points,), by name, except the reading and its declared sd."""
         columns = self.system.simulator.inputs(self.table.covariates)
         return {name: values for name, values in columns.items() if varies(values)}
+
+    @cached_property
+    def driving_columns(self) -> tuple[str, ...]:
+        """Names of the columns, except time, that the simulated readings depend on."""
+
+        def drives(name: str, values: FloatArray) -> bool:
+            def shifted(value: Any, theta: FloatArray, table: RunTable) -> Any:
+                return {**value, name: value[name] + theta}
+
+            def scaled(value: Any, theta: FloatArray, table: RunTable) -> Any:
+                return {**value, name: value[name] * (1 + theta)}
+
+            tried = (shifted, _NUDGE_OF_COLUMN * float(np.nanstd(values))), (scaled, _NUDGE_OF_COLUMN)
+            changes = [self.rms_change_in_sds(Stage.INPUT, act, np.array([[size]])) for act, size in tried]
+            return max(float(change[0]) for change in changes) > 0
+
+        return tuple(name for name, values in self.varying_columns.items() if drives(name, values))
+
+    @cached_property
+    def stored(self) -> StoredFit:
+        """The part of this fit from which its forms can be bound again."""
+        held = (name for name in self.driving_columns if self.is_held_between_rows(name))
+        return self.known or StoredFit(self.table, self.predicted, self.sd, self.states, tuple(held))
 
     @cached_property
     def has_reading(self) -> BoolArray:

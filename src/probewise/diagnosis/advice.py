@@ -143,7 +143,7 @@ def aliases_with_separating_plans(searched: Searched, problem: Linearised, found
         bases[name] = _projected_basis(problem, problem.whiten(templates.columns[best]))[0]
     for pair in itertools.combinations((name for name, basis in bases.items() if basis.size), 2):
         cosines = np.linalg.svd(bases[pair[0]].T @ bases[pair[1]], compute_uv=False)
-        if cosines[0] >= 0.9:
+        if cosines[0] >= 0.9:  # from there on they count as aliases
             pairs.append(Alias(pair, float(min(cosines[0], 1.0)), prepared.apparatus.words.settles_nothing, 0))
     pairs.sort(key=lambda alias: -alias.cosine)
     return pairs_with_separating_scans(pairs, problem, found, chosen, prepared.usable_rows, prepared.apparatus)
@@ -328,7 +328,8 @@ def measurement_separating_rivals(
             together = np.concatenate([taken, rows[k]])
             if k not in chosen and len(together) <= MOST_ADVISED_READINGS:
                 gains[k] = mutual_information_lower_bound(of_readings(together), weights) - told
-        gains[~(gains >= (_WORTHWHILE if chosen else 1e-6) * uncertain)] = 0.0  # also for a model that fails there
+        # For the first scan anything is worth while; not finite is the gain of a model that fails there.
+        gains[~(gains >= (_WORTHWHILE if chosen else 1e-6) * uncertain)] = 0.0
         best = int(np.argmax(gains / [option.minutes for option in offered]))
         if gains[best] == 0.0:
             break

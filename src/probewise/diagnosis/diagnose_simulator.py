@@ -258,7 +258,7 @@ class _Descent:
             curvature = np.where(held[:, :, None] | held[:, None], eye, curvature / scale[:, :, None] / scale[:, None])
             damped = curvature + (damping[go, None, None] + _ROUNDING) * eye
             step = np.linalg.solve(damped, np.where(held, 0.0, downhill / scale)[:, :, None])[:, :, 0] / scale
-            longest = 0.3 * (self.high - self.low)
+            longest = 0.3 * (self.high - self.low)  # step of a coordinate
             to = np.clip(at + np.clip(step, -longest, longest), self.low, self.high)
             then = self._look(to, central=central)
             with np.errstate(invalid="ignore"):
@@ -412,7 +412,7 @@ def without_unpredictable_readings(system: System, recording: RunRecording, *, e
     recording = replace(recording, plan=cast(Plan, table.with_columns(filled)))
     for name in filled if every_row else ():
         beside = recording.usable & ~lost & ~np.isfinite(inputs[name])
-        if 0 < beside.sum() <= 0.1 * recording.usable.sum():
+        if 0 < beside.sum() <= 0.1 * recording.usable.sum():  # the rest tells the noise nearly as well
             readings = count_with_noun(int(beside.sum()), "reading")
             recording = _without_readings(recording, beside, f"{readings} left out: column {name!r} is missing there")
         elif beside.any():
@@ -676,7 +676,7 @@ def finer_step_for_repair(diagnosis: Diagnosis) -> tuple[float, bool] | None:
         return None
     tolerance = STANDS_STILL * float(np.median(model.noise_sd))
     try:
-        theta = model.theta[:4]
+        theta = model.theta[:4]  # samples for which the step is halved
         still = with_converged_step(system, table, theta, effects, tolerance=tolerance, or_finest=True)
     except ParameterError:  # a friction or a bound that no step meets exactly
         return None

@@ -666,7 +666,7 @@ def _next_beta(gain: FloatArray, beta: float) -> float:
     if n_effective((1.0 - beta) * gain) >= enough:
         return 1.0
     low = largest_power(lambda power: (power - beta) * gain, beta, wanted=enough)
-    return min(max(low, beta + 1e-3), 1.0)
+    return min(max(low, beta + 1e-3), 1.0)  # a least step, so that it ends
 
 
 _NEGLIGIBLE = 0.02  # noise sds, over all readings together: smaller changes at one step are neglected

@@ -267,7 +267,7 @@ def sensor_from_samples(sensor: SensorPrior) -> CalibratedSensor:
     # Coordinates that are the same in all samples have a variance too, in the readings' unit where they are levels.
     size, levels = np.ones(len(center)), slice(5, 7) if free else slice(-2, None)
     size[levels] = np.abs(center[levels]).max() or 1.0
-    floor = _RIDGE * np.maximum(np.diag(natural_cov), 1e-16 * size**2)
+    floor = _RIDGE * np.maximum(np.diag(natural_cov), 1e-16 * size**2)  # a variance relative to the size
     factor = np.linalg.cholesky(natural_cov + np.diag(floor))
     return CalibratedSensor(n_gaussians, center, factor, False, free, height_mm, sd_prior)
 

@@ -84,6 +84,7 @@ class TemplateBank:
         out = list[IntArray]()
         for width in dict.fromkeys(self.widths.tolist()):
             members = np.flatnonzero(self.widths == width)
+            # So many numbers are multiplied together as fit a processor's cache.
             at_once = max(2**19 // (max(len(self.templates[0]), 1) * width), 1)
             out += np.split(members, range(at_once, len(members), at_once))
         return out
@@ -302,7 +303,7 @@ class TemplateCache:
             own = templates_of_effect(found, effect.with_fewer_variants(), self.usable)
             each[effect.name] = own.columns
             n_numbers += own.n_numbers
-            if n_numbers > 2**22 or effect is effects[-1]:
+            if n_numbers > 2**22 or effect is effects[-1]:  # of templates that are not remembered
                 yield TemplateBank.by_name(each)
                 each, n_numbers = {}, 0
 

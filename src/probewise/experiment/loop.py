@@ -363,7 +363,7 @@ def _require_possible_reading(experiment: Experiment, reading: Reading, journal:
     try:
         experiment.readout.require_in_range(reading.value)
         plan = experiment.problem([reading]).recording.plan
-        led_state(plan)
+        led_state(plan)  # these two refuse what is out of range
         height_ratio(plan)
     except ParameterError as error:
         if journal is not None:

@@ -95,7 +95,8 @@ def world_like(sensor: FittedSensor, concealed: tuple[Concealed, ...] = ()) -> W
     height_mm = sensor.instrumentation.height_mm or _USUAL_HEIGHT_MM
     noise_sd = float(sensor.noise_sd.mean())
     world = World(spot, means["I_min"], means["I_max"], noise_sd, concealed=concealed, height_mm=height_mm)
-    world.read(Uniform(0.5), 0.0, 0.0, time_s=0.0, rng=None, height_mm=height_mm)
+    if concealed:  # by a reading an effect says what it lacks
+        world.read(Uniform(0.5), 0.0, 0.0, time_s=0.0, rng=None, height_mm=height_mm)
     return world
 
 

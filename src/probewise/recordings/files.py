@@ -248,8 +248,8 @@ def plan_columns(plan: Plan) -> dict[str, Sequence[str]]:
         require(name == name.strip() and name.isprintable(), "name", name, _A_NAME)
     for name in plan.covariates:
         require(name not in (*_KNOWN, SESSION, ""), "covariate", name, "a name that is no column of the format")
-    for scan in plan.scan[1:][np.diff(plan.scan) < 0].tolist():
-        raise ParameterError("scan", scan, "scans in the order they were taken")
+    if (falls := np.flatnonzero(np.diff(plan.scan) < 0)).size:
+        raise ParameterError("scan", int(plan.scan[falls[0] + 1]), "scans in the order they were taken")
     names: dict[int, str] = {}
     for k in np.unique(plan.scan).tolist():  # one like the scan's before gains a word, as a file would join the two
         again = bool(names) and plan.scan_names[k] == names[max(names)]

@@ -234,10 +234,8 @@ def _seen_white_fraction_of_block(
         for start in range(0, mixed_at[0].size, per_block):
             at = pose, row, column = tuple(index[start : start + per_block] for index in mixed_at)
             golden = 0.6180339887498949  # shifts each pixel's sequence by 0 to 1 pixel, evenly along rows and columns
-            first_u, first_v = (
-                np.mod(row * golden + column * _STEP_V, 1.0),
-                np.mod(column * golden + row * _STEP_U, 1.0),
-            )
+            first_u = np.mod(row * golden + column * _STEP_V, 1.0)
+            first_v = np.mod(column * golden + row * _STEP_U, 1.0)
             ray_u = u[column][:, None] + spot.pixel_mm * np.mod(first_u[:, None] + np.arange(n_rays) * _STEP_U, 1.0)
             ray_v = v[row][:, None] + spot.pixel_mm * np.mod(first_v[:, None] + np.arange(n_rays) * _STEP_V, 1.0)
             c, s = cos[pose, 0], sin[pose, 0]

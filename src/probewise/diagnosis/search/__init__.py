@@ -568,11 +568,8 @@ def refit_at_other_orders(state: SearchState, by_mean: Mapping[Names, float]) ->
         source = state.best_candidate(names)
         if source is None or by_mean[names] < 1e-4 * known:
             continue
-        own, law, fitted = (
-            state.candidates[source.n_gaussians, ()].log_z,
-            state.refits.likeliest_law(source),
-            source.found,
-        )
+        own, fitted = state.candidates[source.n_gaussians, ()].log_z, source.found
+        law = state.refits.likeliest_law(source)
         for null in state.nulls:
             # A freer SSF that the evidence rejects by itself is also rejected with an effect.
             ahead, more = null.log_z - own, null.ssf_degrees_of_freedom
@@ -809,7 +806,7 @@ def _refit_favoured_by_screening(state: SearchState, posterior: Callable[[], Hyp
         by_mean = posterior().marginal_over_noise
         settled = {(), UNKNOWN} | state.undetected | state.refitted_combinations
         names = max((key for key in by_mean if key not in settled), key=lambda key: by_mean[key], default=())
-        if by_mean.get(names, 0.0) <= 0.02 or not names:
+        if by_mean.get(names, 0.0) <= 0.02 or not names:  # too improbable to be worth a refit
             return
         part = state.largest_refitted_part(names)
         if state.refits.given_null is not None and part.names and part not in screened:
